@@ -1,6 +1,8 @@
-"""Run a benchmark, after the stages of the scene that it measures on: python -m benchmarks NAME [ARGUMENTS].
+"""Run a benchmark, after the stages of the scene that it measures on: python -m benchmarks NAME
+[ARGUMENTS].
 
-With --work FOLDER among the arguments, a folder of a scene's links, that scene is measured as it is.
+With --work FOLDER among the arguments, a folder of a scene's links, that scene is measured as it
+is.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ SCENE = "office0"
 
 @dataclass(frozen=True)
 class Benchmark:
-    """module: in `benchmarks`; stages: what it needs of SCENE, under `settings` (as `set=` takes them)."""
+    """module: in `benchmarks`; stages: what it needs of SCENE, under `settings` (as `set=` takes
+    them).
+    """
 
     module: str
     measures: str
@@ -29,33 +33,63 @@ class Benchmark:
 BENCHMARKS = {
     "raster": Benchmark("raster", "the rasterizer against its bars: milliseconds, ratios"),
     "cost": Benchmark(
-        "training.cost", "whole trainings beside plain 3DGS; --growth: by Gaussians, pixels, views", ("sfm", "teacher")
+        "training.cost",
+        "whole trainings beside plain 3DGS; --growth: by Gaussians, pixels, views",
+        ("sfm", "teacher"),
     ),
-    "descriptor": Benchmark("descriptor", "the descriptor: regions a second, error, growth of sampling"),
+    "descriptor": Benchmark(
+        "descriptor", "the descriptor: regions a second, error, growth of sampling"
+    ),
     "lift": Benchmark(
-        "scenes.lift", "features lifted to a finished scene: seconds", ("train", "teacher"), "train.features=lifted"
+        "scenes.lift",
+        "features lifted to a finished scene: seconds",
+        ("train", "teacher"),
+        "train.features=lifted",
     ),
     "refine": Benchmark(
         "scenes.refine",
         "error against run time of what follows a training: lift, smoothing, encoders",
         ("lift",),
     ),
-    "trust": Benchmark("teachers.trust", "whether views' agreement ranks 2D teachers as true mIoU does; no training"),
-    "mesh": Benchmark("scenes.mesh", "the mesh against exact depth: F-score, labels, seconds by voxel", ("report",)),
-    "label": Benchmark("scenes.label", "which Gaussians of a PLY are named right by shape alone; trains its scenes"),
-    "teaching": Benchmark("teachers.teaching", "what the encoder of shape owes to transformers and descriptors"),
-    "lessons": Benchmark("teachers.lessons", "what lessons of scenes, and labelled points, are worth in other scenes"),
-    "unposed": Benchmark("scenes.unposed", "poses of photos that come alone, beside pycolmap's defaults; args=FOLDERS"),
-    "query": Benchmark("scenes.query", "asking at the suggested cut: precision, recall, absent words; trains 5 rooms"),
+    "trust": Benchmark(
+        "teachers.trust",
+        "whether views' agreement ranks 2D teachers as true mIoU does; no training",
+    ),
+    "mesh": Benchmark(
+        "scenes.mesh",
+        "the mesh against exact depth: F-score, labels, seconds by voxel",
+        ("report",),
+    ),
+    "label": Benchmark(
+        "scenes.label", "which Gaussians of a PLY are named right by shape alone; trains its scenes"
+    ),
+    "teaching": Benchmark(
+        "teachers.teaching", "what the encoder of shape owes to transformers and descriptors"
+    ),
+    "lessons": Benchmark(
+        "teachers.lessons", "what lessons of scenes, and labelled points, are worth in other scenes"
+    ),
+    "unposed": Benchmark(
+        "scenes.unposed",
+        "poses of photos that come alone, beside pycolmap's defaults; args=FOLDERS",
+    ),
+    "query": Benchmark(
+        "scenes.query",
+        "asking at the suggested cut: precision, recall, absent words; trains 5 rooms",
+    ),
     "gpu": Benchmark(
-        "training.gpu", "a GPU beside the CPU: seconds, PSNR, mIoU, frames/s, launches, memory", ("sfm", "teacher")
+        "training.gpu",
+        "a GPU beside the CPU: seconds, PSNR, mIoU, frames/s, launches, memory",
+        ("sfm", "teacher"),
     ),
     "stability": Benchmark("stability.main", "every extreme case of the maths; fails if one does"),
 }
 
 
 def linked(benchmark: Benchmark) -> Path:
-    """The folder of SCENE's links, its `stages` brought up to date. Raises CalledProcessError if one fails."""
+    """The folder of SCENE's links, its `stages` brought up to date. Raises CalledProcessError if
+    one fails.
+    """
     command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "run", "--scene", SCENE]
     command += ["--set", benchmark.settings] if benchmark.settings else []
     for stage in benchmark.stages:
@@ -72,10 +106,15 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     name, *rest = arguments
     if name not in BENCHMARKS:
-        print(f"no benchmark is called {name[:60]!a}; there are {', '.join(BENCHMARKS)}", file=sys.stderr)
+        print(
+            f"no benchmark is called {name[:60]!a}; there are {', '.join(BENCHMARKS)}",
+            file=sys.stderr,
+        )
         return 2
     benchmark = BENCHMARKS[name]
-    if benchmark.stages and not any(text in ("-h", "--help") or text.startswith("--work") for text in rest):
+    if benchmark.stages and not any(
+        text in ("-h", "--help") or text.startswith("--work") for text in rest
+    ):
         try:
             rest = ["--work", str(linked(benchmark)), *rest]
         except subprocess.CalledProcessError as error:

@@ -1,6 +1,8 @@
-"""The compiled descriptor: regions a second beside one batched eigh, errors against 60 digits, growth of sampling.
+"""The compiled descriptor: regions a second beside one batched eigh, errors against 60 digits,
+growth of sampling.
 
-Regions are flat clouds and pieces of a generated office; errors are relative to a region's largest value.
+Regions are flat clouds and pieces of a generated office; errors are relative to a region's largest
+value.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ from chebsplat.synthetic import layout
 
 N, SETTINGS = 64, {"n_angles": 4, "max_degree": 8, "anisotropy": 30.0, "bandwidth": 0.7}
 ERROR = 5e-6  # bar, at worst
-Regions = tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # means, scales [M, n, 3], rotmats [M, n, 3, 3]
+# means, scales [M, n, 3], rotmats [M, n, 3, 3]
+Regions = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 def clouds(m: int, n: int) -> Regions:
@@ -32,22 +35,36 @@ def clouds(m: int, n: int) -> Regions:
     g = torch.Generator().manual_seed(0)
     means = torch.randn(m, n, 3, generator=g, dtype=torch.float64) * torch.tensor([1.0, 0.7, 0.2])
     scales = torch.rand(m, n, 3, generator=g, dtype=torch.float64) * torch.tensor([0.3, 0.2, 0.02])
-    return means, scales + 0.01, rotation_matrices(torch.randn(m, n, 4, generator=g, dtype=torch.float64))
+    return (
+        means,
+        scales + 0.01,
+        rotation_matrices(torch.randn(m, n, 4, generator=g, dtype=torch.float64)),
+    )
 
 
 def room(m: int, n: int) -> Regions:
     """Regions of Gaussians on the surfaces of a generated office, 5 mm off."""
     soup, rng = layout.build("office", 0).soup, np.random.default_rng(0)
     corners = soup.vertices[soup.triangles].astype(np.float64)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
     corners = corners[rng.choice(len(area), 20_000, p=area / area.sum())]
     points = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), len(corners)), corners)
     points += 0.005 * rng.standard_normal(points.shape)
-    raw = initial_gaussians(points, np.full(points.shape, 128, np.uint8), local_shape(points, 16)[0])
+    raw = initial_gaussians(
+        points, np.full(points.shape, 128, np.uint8), local_shape(points, 16)[0]
+    )
     _, quats, scales, _ = activated(raw)
-    members = torch.as_tensor(regions_of(points, DescribeSection(n_regions=4 * m, region_size=n)).members)
+    members = torch.as_tensor(
+        regions_of(points, DescribeSection(n_regions=4 * m, region_size=n)).members
+    )
     members = members[(members >= 0).all(1)][:m]
-    return torch.as_tensor(points)[members], scales[members].double(), rotation_matrices(quats[members]).double()
+    return (
+        torch.as_tensor(points)[members],
+        scales[members].double(),
+        rotation_matrices(quats[members]).double(),
+    )
 
 
 def described(regions: Regions) -> torch.Tensor:
@@ -92,8 +109,15 @@ def main(arguments: Sequence[str]) -> int:
     rows.append({"what": "of batched eigh in float32 alone, 1 thread", "value": rate})
     for n in (10_000, 100_000, 1_000_000):
         points = np.random.default_rng(0).random((n, 3)) * [5.0, 4.0, 0.3]
-        seconds = best(lambda points=points: regions_of(points, DescribeSection(n_regions=2048, region_size=N)), 2)  # type: ignore[misc]
-        rows.append({"what": f"milliseconds of sampling 2048 regions of {n} points", "value": 1e3 * seconds})
+        seconds = best(
+            lambda points=points: regions_of(
+                points, DescribeSection(n_regions=2048, region_size=N)
+            ),
+            2,
+        )  # type: ignore[misc]
+        rows.append(
+            {"what": f"milliseconds of sampling 2048 regions of {n} points", "value": 1e3 * seconds}
+        )
     rows += [{"what": f"largest error, {name}", "value": value} for name, value in errors.items()]
     for row in rows:
         print("{what:<52} {value:10.3g}".format(**row))

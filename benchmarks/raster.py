@@ -1,7 +1,8 @@
-"""How fast the CPU rasterizer is: ratios beside their bars, whole steps and the kernel's stages in milliseconds.
+"""How fast the CPU rasterizer is: ratios beside their bars, whole steps and the kernel's stages in
+milliseconds.
 
-A step is forward, L1 and backward. Variants take turns, round by round, and the fastest round of each counts: other
-load on the machine only ever adds.
+A step is forward, L1 and backward. Variants take turns, round by round, and the fastest round of
+each counts: other load on the machine only ever adds.
 """
 
 from __future__ import annotations
@@ -33,11 +34,18 @@ def scene(n: int, channels: int) -> list[torch.Tensor]:
     room = torch.tensor([5.0, 3.5, 4.0]), torch.tensor([-2.5, -1.75, 0.8])
     means = torch.rand(n, 3, generator=g) * room[0] + room[1]
     scales = (70 / n) ** (1 / 3) * 0.3 * (0.4 + torch.rand(n, 3, generator=g))
-    values = [means, torch.randn(n, 4, generator=g), scales, torch.rand(n, generator=g) * 0.9 + 0.05]
+    values = [
+        means,
+        torch.randn(n, 4, generator=g),
+        scales,
+        torch.rand(n, generator=g) * 0.9 + 0.05,
+    ]
     return [v.requires_grad_(True) for v in [*values, torch.rand(n, channels, generator=g)]]
 
 
-def camera(width: int = SIZE[0], height: int = SIZE[1]) -> tuple[torch.Tensor, torch.Tensor, int, int]:
+def camera(
+    width: int = SIZE[0], height: int = SIZE[1]
+) -> tuple[torch.Tensor, torch.Tensor, int, int]:
     K = torch.tensor([[[0.7 * width, 0, width / 2], [0, 0.7 * width, height / 2], [0, 0, 1]]])
     return torch.eye(4)[None], K, width, height
 
@@ -62,7 +70,9 @@ def step(backend: str, n: int = N, channels: int = CHANNELS) -> Action:
 
 
 def training_step(features: int, *, by_cell: bool) -> Action:
-    """A training's step: three colours and `features` of a teacher at a quarter of the size, both losses."""
+    """A training's step: three colours and `features` of a teacher at a quarter of the size, both
+    losses.
+    """
     arguments, (width, height) = scene(N, 3 + features), SIZE
     color, target = torch.rand(height, width, 3), torch.rand(height // 4, width // 4, features)
 
@@ -72,7 +82,9 @@ def training_step(features: int, *, by_cell: bool) -> Action:
         *gaussians, channels = arguments
         if features and by_cell:
             parts = [part.contiguous() for part in channels.split([3, features], -1)]
-            render, _, meta = rasterize(*gaussians, parts[0], *camera(), backend="cpu", cell_colors=parts[1])
+            render, _, meta = rasterize(
+                *gaussians, parts[0], *camera(), backend="cpu", cell_colors=parts[1]
+            )
             image, rendered = render[0], meta["cells"][0]
         else:
             render = rasterize(*gaussians, channels, *camera(), backend="cpu")[0][0]
@@ -87,15 +99,26 @@ def stages() -> dict[str, Action]:
     """The numba stages by themselves, without torch; `forward` and `backward` are the kernels."""
     means, quats, scales, opacities, colors = (t.detach().numpy() for t in scene(N, CHANNELS))
     viewmats, Ks, width, height = camera()
-    view, ceiling = (viewmats[0].double().numpy(), Ks[0].double().numpy(), width, height), np.float32(0.999)
+    view, ceiling = (
+        (viewmats[0].double().numpy(), Ks[0].double().numpy(), width, height),
+        np.float32(0.999),
+    )
     gaussians, by_channel = (means, quats, scales), (opacities, colors, colors[:, :0])
     no_slope, no_cells = np.zeros(N, np.float32), np.zeros((height // 4, width // 4, 0), np.float32)
     rng = np.random.default_rng(0)
-    grad = rng.random((height, width, CHANNELS), np.float32), no_cells, rng.random((height, width), np.float32)
-    means2d, covariances, whitening, _, depths, radii, _ = ellipses.project(*gaussians, *view, 0.01, 1e10, 0.3)
+    grad = (
+        rng.random((height, width, CHANNELS), np.float32),
+        no_cells,
+        rng.random((height, width), np.float32),
+    )
+    means2d, covariances, whitening, _, depths, radii, _ = ellipses.project(
+        *gaussians, *view, 0.01, 1e10, 0.3
+    )
 
     def bins() -> binning.Bins:
-        return binning.bin_gaussians(means2d, covariances, depths, radii, *by_channel, width, height)
+        return binning.bin_gaussians(
+            means2d, covariances, depths, radii, *by_channel, width, height
+        )
 
     found = bins()
 
@@ -105,7 +128,9 @@ def stages() -> dict[str, Action]:
     splats = pack()
 
     def forward() -> tuple[np.ndarray, ...]:
-        return tiles.forward(splats, found.tile_starts, found.rank, CHANNELS, 0, width, height, ceiling)
+        return tiles.forward(
+            splats, found.tile_starts, found.rank, CHANNELS, 0, width, height, ceiling
+        )
 
     _, _, _, *seen = forward()
 
@@ -119,12 +144,15 @@ def stages() -> dict[str, Action]:
         "pack": pack,
         "forward": forward,
         "backward": backward,
-        "project back": lambda: ellipses.project_adjoint(*gaussians, *view, 0.3, radii, to_means2d, moments, no_slope),
+        "project back": lambda: ellipses.project_adjoint(
+            *gaussians, *view, 0.3, radii, to_means2d, moments, no_slope
+        ),
     }
 
 
 def take_turns(variants: dict[str, tuple[int, Action]], rounds: int) -> dict[str, float]:
-    """Milliseconds of the fastest of `rounds` by name; variants are (threads, action). Each turn begins with a run that
+    """Milliseconds of the fastest of `rounds` by name; variants are (threads, action). Each turn
+    begins with a run that
     does not count: it fills the caches, and starts as many threads.
     """
     best = dict.fromkeys(variants, np.inf)
@@ -147,8 +175,16 @@ def main(arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     if options.yardstick:
         for n in (1, 2):
-            command = [sys.executable, "-P", str(options.yardstick / "yardstick.py"), "--beside", "chebsplat"]
-            subprocess.run([*command, "--threads", str(n), "--rounds", str(options.rounds)], check=True)
+            command = [
+                sys.executable,
+                "-P",
+                str(options.yardstick / "yardstick.py"),
+                "--beside",
+                "chebsplat",
+            ]
+            subprocess.run(
+                [*command, "--threads", str(n), "--rounds", str(options.rounds)], check=True
+            )
     cpu = step("cpu")
     variants: dict[str, tuple[int, Action]] = {
         "torch, 4 threads": (4, step("reference")),
@@ -168,14 +204,22 @@ def main(arguments: Sequence[str]) -> int:
         ("torch over cpu, four threads", times["torch, 4 threads"] / base, ">=", 20),
         ("19 channels over 3", base / times["cpu, 3 channels"], "<=", 2.0),
         ("100k Gaussians over 20k", times["cpu, 100k"] / base, "<=", 1.9),
-        ("32 features by cell over none", times["training step, 32 features by cell"] / colors, "<=", 1.5),
+        (
+            "32 features by cell over none",
+            times["training step, 32 features by cell"] / colors,
+            "<=",
+            1.5,
+        ),
     ]
     if shared.cores() >= 4:
         bars.append(("one thread over four", times["cpu, 1 thread"] / base, ">=", 2.5))
     else:
         print(f"one thread over four: not asked on {shared.cores()} cores")
     print(shared.machine())
-    print(f"{N} Gaussians, {SIZE[0]}x{SIZE[1]}, {CHANNELS} channels; fastest of {options.rounds} rounds")
+    print(
+        f"{N} Gaussians, {SIZE[0]}x{SIZE[1]}, {CHANNELS} channels; fastest of {options.rounds} "
+        "rounds"
+    )
     rows: list[dict[str, Any]] = []
     for name, ms in times.items():
         print(f"  {name:<36} {ms:9.2f} ms")

@@ -1,4 +1,6 @@
-"""What the benchmarks share: their arguments, rows as CSV, and the machine that they are measured on."""
+"""What the benchmarks share: their arguments, rows as CSV, and the machine that they are measured
+on.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,20 @@ from chebsplat.stages.runtime.machine import cores, load, processor
 
 
 def parser(name: str, description: str | None, work: bool = False) -> ArgumentParser:
-    """The arguments of benchmark `name`: --out, and --work where it measures on a scene; it adds its own."""
+    """The arguments of benchmark `name`: --out, and --work where it measures on a scene; it adds
+    its own.
+    """
     prog = f"python -m benchmarks {name}"
-    arguments = ArgumentParser(prog, description=description, formatter_class=RawDescriptionHelpFormatter)
+    arguments = ArgumentParser(
+        prog, description=description, formatter_class=RawDescriptionHelpFormatter
+    )
     if work:
-        arguments.add_argument("--work", type=Path, required=True, help="a scene's links, such as work/office0")
-    arguments.add_argument("--out", type=Path, default=Path("build/bench"), help="folder for tables and figures")
+        arguments.add_argument(
+            "--work", type=Path, required=True, help="a scene's links, such as work/office0"
+        )
+    arguments.add_argument(
+        "--out", type=Path, default=Path("build/bench"), help="folder for tables and figures"
+    )
     return arguments
 
 
@@ -52,7 +62,8 @@ def there(scenes: Sequence[str]) -> list[str]:
 
 
 def finished(wanted: Iterable[tuple[str, str]], stage: str) -> list[Plan]:
-    """Plans of (scene, settings as `set=` takes them), run up to a stage, without a path for each on stdout.
+    """Plans of (scene, settings as `set=` takes them), run up to a stage, without a path for each
+    on stdout.
 
     Raises SystemExit with the run's exit code if a step fails.
     """
@@ -69,13 +80,19 @@ def finished(wanted: Iterable[tuple[str, str]], stage: str) -> list[Plan]:
 def machine() -> str:
     """What figures are measured with: versions, threads, processor, load."""
     return (
-        f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on {torch.get_num_threads()} threads, "
+        f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on "
+        f"{torch.get_num_threads()} threads, "
         f"numba {numba.__version__} on {numba.get_num_threads()}; {processor()}, {cores()} cores, "
         f"load {load():.1f}"
     )
 
 
 def peak_memory() -> int:
-    """Bytes that were resident in this process at most; `ru_maxrss` is at least that of whoever started it."""
+    """Bytes that were resident in this process at most; `ru_maxrss` is at least that of whoever
+    started it.
+    """
     status = Path("/proc/self/status").read_text()
-    return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) * 1024
+    return (
+        int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1])
+        * 1024
+    )

@@ -4,16 +4,18 @@ import os
 from importlib import import_module
 from typing import Any
 
-# Idle OpenMP threads must sleep: spinning ones cost an order of magnitude on a busy machine. But not at once: a few
-# microseconds of waiting spare most wake-ups, a third of a training step, and cost a busy machine nothing measurable.
+# Idle OpenMP threads must sleep: spinning ones cost an order of magnitude on a busy machine. But
+# not at once: a few microseconds of waiting spare most wake-ups, a third of a training step, and
+# cost a busy machine nothing measurable.
 # Must precede torch.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-# One OpenMP serves numba and torch, and numba's first kernel sets the number of threads of both: let it be the same.
+# One OpenMP serves numba and torch, and numba's first kernel sets the number of threads of both:
+# let it be the same.
 if os.environ.get("OMP_NUM_THREADS", "").isdigit():
     os.environ.setdefault("NUMBA_NUM_THREADS", os.environ["OMP_NUM_THREADS"])
-# onnxruntime writes an id of the machine into the home folder and reports to its maker, from its import on, unless
-# this is set before. ORT_DISABLE_TELEMETRY=0 is for who wants that.
+# onnxruntime writes an id of the machine into the home folder and reports to its maker, from its
+# import on, unless this is set before. ORT_DISABLE_TELEMETRY=0 is for who wants that.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 __version__ = "0.2.0"
@@ -22,7 +24,9 @@ API = ("load", "run_stage", "train")
 
 
 def __getattr__(name: str) -> Any:
-    """`chebsplat.load`, `train` and `run_stage`, which are imported when first asked for: most commands need none."""
+    """`chebsplat.load`, `train` and `run_stage`, which are imported when first asked for: most
+    commands need none.
+    """
     if name in API:  # not an import statement: no stage depends on what the API imports
         return getattr(import_module("chebsplat.pipelines.api"), name)
     raise AttributeError(f"module 'chebsplat' has no attribute {name!r}")

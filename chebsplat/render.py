@@ -1,4 +1,5 @@
-"""Rendering of a finished scene: colour by SH degree, so that a Gaussian costs only the bands it keeps.
+"""Rendering of a finished scene: colour by SH degree, so that a Gaussian costs only the bands it
+keeps.
 
 `frame_parts` takes the steps of `SceneRenderer.render` on the CPU one by one under a clock.
 """
@@ -26,10 +27,12 @@ NEAR, FAR, BLUR, MAX_ALPHA = 0.01, 1e10, 0.3, 0.99  # the defaults of `rasterize
 
 
 def colors_by_degree(sh0: Tensor, shN: Tensor, directions: Tensor, degrees: Tensor) -> Tensor:
-    """Colours [N, 3] of Gaussians sorted by ascending degree; each bucket evaluates its own bands only.
+    """Colours [N, 3] of Gaussians sorted by ascending degree; each bucket evaluates its own bands
+    only.
 
     Raises: ValueError if `degrees` [N] does not ascend.
-    Choices: on a GPU all bands of all, those above a degree being zero: a bucket costs more there than it saves.
+    Choices: on a GPU all bands of all, those above a degree being zero: a bucket costs more there
+      than it saves.
     """
     if sh0.device.type == "cuda":
         return eval_sh(sh0, shN, directions, math.isqrt(shN.shape[1] + 1) - 1)
@@ -51,24 +54,36 @@ def focals(Ks: Tensor | np.ndarray) -> np.ndarray:
 
 
 class SceneRenderer:
-    """Renders an exported scene (`formats.scene.Scene.parameters`) on a device; its depth, always on the CPU.
+    """Renders an exported scene (`formats.scene.Scene.parameters`) on a device; its depth, always
+    on the CPU.
 
-    Ks: [V, 3, 3] of the cameras that the scene was trained on. A view that is finer than all of them is
-    blurred as much as theirs were, since what was trained under their blur is too thin without; None: every
-    view has the rasterizer's own blur.
+    Ks: [V, 3, 3] of the cameras that the scene was trained on. A view that is finer than all of
+      them is
+    blurred as much as theirs were, since what was trained under their blur is too thin without;
+    None: every view has the rasterizer's own blur.
     """
 
-    def __init__(self, parameters: dict[str, np.ndarray], device: str = "cpu", Ks: np.ndarray | None = None):
-        raw = {name: torch.from_numpy(np.ascontiguousarray(values)).to(device) for name, values in parameters.items()}
+    def __init__(
+        self, parameters: dict[str, np.ndarray], device: str = "cpu", Ks: np.ndarray | None = None
+    ):
+        raw = {
+            name: torch.from_numpy(np.ascontiguousarray(values)).to(device)
+            for name, values in parameters.items()
+        }
         self.on_gpu = raw["means"].device.type == "cuda"
         self.finest = math.inf if Ks is None else float(focals(Ks).max())
         means, quats, scales, opacities = activated(raw)
         if self.on_gpu:
             lights = {name: raw[name] for name in ("sh0", "shN", "features") if name in raw}
             flat = torch.cat([part.flatten(1) for part in lights.values()], 1)
-            means, quats, scales, opacities, flat = made_harmless(means, quats, scales, opacities, flat)
+            means, quats, scales, opacities, flat = made_harmless(
+                means, quats, scales, opacities, flat
+            )
             parts = flat.split([part.shape[1:].numel() for part in lights.values()], 1)
-            raw |= {name: part.reshape(lights[name].shape) for name, part in zip(lights, parts, strict=True)}
+            raw |= {
+                name: part.reshape(lights[name].shape)
+                for name, part in zip(lights, parts, strict=True)
+            }
         self.means, self.quats, self.scales, self.opacities = means, quats, scales, opacities
         self.raw, self.reach = raw, 3 * self.scales.amax(1)
         self.normals = torch.from_numpy(surface_of(parameters)[0])
@@ -80,15 +95,20 @@ class SceneRenderer:
         return colors_by_degree(sh0, shN, take(self.means, index) - eye, degrees)
 
     @torch.no_grad()
-    def render(self, view: View, with_features: bool = False) -> tuple[np.ndarray, np.ndarray | None]:
+    def render(
+        self, view: View, with_features: bool = False
+    ) -> tuple[np.ndarray, np.ndarray | None]:
         """Image u8 [H, W, 3], and features f32 [H, W, C] where asked for and present."""
         finer = 1.0 if self.finest == math.inf else max(float(focals(view.K)) / self.finest, 1.0)
         view = view.to(self.means.device)
-        index = None if self.on_gpu else in_frustum(self.means, view, self.reach)  # nothing waits for their number
+        # nothing waits for their number
+        index = None if self.on_gpu else in_frustum(self.means, view, self.reach)
         channels = self.colors(view, index)
         if with_features and "features" in self.raw:
             channels = torch.cat([channels, take(self.raw["features"], index)], 1)
-        gaussians = (take(part, index) for part in (self.means, self.quats, self.scales, self.opacities))
+        gaussians = (
+            take(part, index) for part in (self.means, self.quats, self.scales, self.opacities)
+        )
         camera = (view.viewmat[None], view.K[None], view.width, view.height)
         options: dict[str, Any] = {"eps2d": BLUR * finer**2}
         if self.on_gpu:  # what the other backends do not know
@@ -103,32 +123,50 @@ class SceneRenderer:
 
         Args: nearest: scene units; what is nearer has no depth.
         Returns: depth is nan where nothing is covered.
-        Choices: Gaussians are planes (`splats.planes.inverse_depths`), whose depth `rasterize.depths` takes where most
-          of a pixel's light has been gathered: their mean lies in front of walls.
+        Choices: Gaussians are planes (`splats.planes.inverse_depths`), whose depth
+          `rasterize.depths` takes where most of a pixel's light has been gathered: their mean lies
+          in front of walls.
         """
         index = in_frustum(self.means, view.to(self.means.device), self.reach).cpu()
         K, pose = view.K.double().cpu(), view.viewmat.double().cpu()
         held = (self.means, self.quats, self.scales, self.opacities)
         gaussians = tuple(part.cpu()[index] for part in held)
-        means, normals = (values.double() @ pose[:3, :3].T for values in (gaussians[0], self.normals[index]))
+        means, normals = (
+            values.double() @ pose[:3, :3].T for values in (gaussians[0], self.normals[index])
+        )
         planes = inverse_depths(means + pose[:3, 3], normals, K, nearest)
         arrays = tuple(part.numpy() for part in gaussians)
-        depth, covered = depths(arrays, pose.numpy(), K.numpy(), (view.width, view.height), planes.numpy())
-        return np.where((covered > 1e-3) & (depth > nearest) & np.isfinite(depth), depth, np.float32(np.nan)), covered
+        depth, covered = depths(
+            arrays, pose.numpy(), K.numpy(), (view.width, view.height), planes.numpy()
+        )
+        return np.where(
+            (covered > 1e-3) & (depth > nearest) & np.isfinite(depth), depth, np.float32(np.nan)
+        ), covered
 
 
 @torch.no_grad()
 def frame_parts(renderer: SceneRenderer, view: View) -> tuple[dict[str, float], np.ndarray]:
-    """Seconds of each of PARTS for one frame in colour alone, and the frame, u8 [H, W, 3], as `render` gives it.
+    """Seconds of each of PARTS for one frame in colour alone, and the frame, u8 [H, W, 3], as
+    `render` gives it.
 
-    Choices: culling belongs to projection; packing the sorted splats to the sort; rounding to 8 bits to the blend.
+    Choices: culling belongs to projection; packing the sorted splats to the sort; rounding to 8
+      bits to the blend.
     """
     clock = [time.perf_counter()]
     index = in_frustum(renderer.means, view, renderer.reach)
     means, quats, scales, opacities = (
-        t[index].contiguous() for t in (renderer.means, renderer.quats, renderer.scales, renderer.opacities)
+        t[index].contiguous()
+        for t in (renderer.means, renderer.quats, renderer.scales, renderer.opacities)
     )
-    camera = (view.viewmat.double().numpy(), view.K.double().numpy(), view.width, view.height, NEAR, FAR, BLUR)
+    camera = (
+        view.viewmat.double().numpy(),
+        view.K.double().numpy(),
+        view.width,
+        view.height,
+        NEAR,
+        FAR,
+        BLUR,
+    )
     projected = ellipses.project(means.numpy(), quats.numpy(), scales.numpy(), *camera)
     centers, covariances, whitening, _, depths, radii, _ = projected
     clock.append(time.perf_counter())
@@ -137,10 +175,14 @@ def frame_parts(renderer: SceneRenderer, view: View) -> tuple[dict[str, float], 
     colors = colors_by_degree(sh0, shN, means - eye, degrees).contiguous().numpy()
     clock.append(time.perf_counter())
     strengths, size, none = opacities.numpy(), (view.width, view.height), colors[:, :0]
-    bins = binning.bin_gaussians(centers, covariances, depths, radii, strengths, colors, none, *size)
+    bins = binning.bin_gaussians(
+        centers, covariances, depths, radii, strengths, colors, none, *size
+    )
     splats = tiles.pack(bins.order, centers, whitening, strengths, colors, none)
     clock.append(time.perf_counter())
-    image, *_ = tiles.forward(splats, bins.tile_starts, bins.rank, 3, 0, *size, np.float32(MAX_ALPHA))
+    image, *_ = tiles.forward(
+        splats, bins.tile_starts, bins.rank, 3, 0, *size, np.float32(MAX_ALPHA)
+    )
     frame = (torch.from_numpy(image).clamp(0, 1) * 255).round().byte().numpy()
     clock.append(time.perf_counter())
     return dict(zip(PARTS, np.diff(clock).tolist(), strict=True)), frame

@@ -1,4 +1,6 @@
-"""Views: one camera at one resolution, what lies in its frustum, and the photos a training looks at."""
+"""Views: one camera at one resolution, what lies in its frustum, and the photos a training looks
+at.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def in_frustum(means: Tensor, view: View, reach: Tensor) -> Tensor:
 
 
 def may_be_seen(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -> Tensor:
-    """Whether points' spheres of radius `reach` [N] may touch the image, bool [N]; those of NaN never do."""
+    """Whether points' spheres of radius `reach` [N] may touch the image, bool [N]; those of NaN
+    never do.
+    """
     camera = means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
     x, y, z = camera.unbind(-1)
     half_x, half_y = 0.5 * view.width * (1 + margin), 0.5 * view.height * (1 + margin)
@@ -47,10 +51,11 @@ def may_be_seen(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) 
 
 
 def remembered(read: Callable[[Any], Tensor], budget: int) -> Callable[[Any], Tensor]:
-    """`read`, whose results stay in memory while `budget` bytes last; the others are read at every call.
+    """`read`, whose results stay in memory while `budget` bytes last; the others are read at every
+    call.
 
-    Choices: what came first stays. Views are visited in random order, once a round: to drop the least recently used
-      for another would lose it before it is needed again.
+    Choices: what came first stays. Views are visited in random order, once a round: to drop the
+      least recently used for another would lose it before it is needed again.
     """
     kept: dict[Hashable, Tensor] = {}
     left = budget
@@ -69,8 +74,8 @@ def remembered(read: Callable[[Any], Tensor], budget: int) -> Callable[[Any], Te
 
 
 class Stored:
-    """Arrays [V, ...] of views, indexed as a tensor would be, that are read when their view is looked at: `read(view)`
-    is a tensor, and what fits into `budget` bytes stays in memory.
+    """Arrays [V, ...] of views, indexed as a tensor would be, that are read when their view is
+    looked at: `read(view)` is a tensor, and what fits into `budget` bytes stays in memory.
     """
 
     def __init__(self, read: Callable[[int], Tensor], count: int, budget: int):
@@ -86,7 +91,9 @@ class Stored:
 
 
 def stacked(read: Callable[[int], Tensor], count: int, budget: int) -> Tensor | Stored:
-    """Arrays [V, ...] of views in memory where they fit into `budget` bytes, otherwise as they are looked at."""
+    """Arrays [V, ...] of views in memory where they fit into `budget` bytes, otherwise as they are
+    looked at.
+    """
     first = read(0)
     if count * first.nbytes > budget:
         return Stored(read, count, budget)
@@ -94,8 +101,9 @@ def stacked(read: Callable[[int], Tensor], count: int, budget: int) -> Tensor | 
 
 
 class TaughtLabels(NamedTuple):
-    """What a teacher takes a view's cells for: classes i64 [h, w], -1 where it says nothing; confidence [h, w] in
-    [0, 1]; class_codes [L, C] that features of a label are near; complete: whether every cell has a label.
+    """What a teacher takes a view's cells for: classes i64 [h, w], -1 where it says nothing;
+    confidence [h, w] in [0, 1]; class_codes [L, C] that features of a label are near; complete:
+    whether every cell has a label.
     """
 
     classes: Tensor
@@ -119,8 +127,9 @@ class Window(NamedTuple):
 
 @dataclass
 class Views:
-    """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None, both as tensors or stored; features: view
-    index -> [h, w, C]; labels: view index -> `TaughtLabels` of these h × w cells, None where the teacher has none;
+    """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None, both as tensors or
+    stored; features: view index -> [h, w, C]; labels: view index -> `TaughtLabels` of these h × w
+    cells, None where the teacher has none;
     depth: view index and factor -> z-depths [H, W] at 1/factor, scene units, nan where unknown.
     """
 
@@ -135,8 +144,9 @@ class Views:
     scaled_Ks: dict[int, Tensor] = field(default_factory=dict)  # by factor, once asked for
 
     def to(self, device: str | torch.device) -> Views:
-        """The same views on a device: photos, masks and cameras for good, labels for each step anew, and
-        features and depth as steps read them, of which DEVICE_BYTES each stay there; themselves where they lie there.
+        """The same views on a device: photos, masks and cameras for good, labels for each step
+        anew, and features and depth as steps read them, of which DEVICE_BYTES each stay there;
+        themselves where they lie there.
         """
         if torch.device(device) == self.Ks.device:
             return self
@@ -151,7 +161,9 @@ class Views:
         def labels_there(index: int) -> TaughtLabels:
             assert labels is not None
             classes, confidence, codes, complete = labels(index)
-            return TaughtLabels(classes.to(device), confidence.to(device), codes.to(device), complete)
+            return TaughtLabels(
+                classes.to(device), confidence.to(device), codes.to(device), complete
+            )
 
         return Views(
             self.names,
@@ -170,7 +182,9 @@ class Views:
         K = self._Ks_at(factor)[index]
         if window is not None:
             width, height = window.width, window.height
-            K = torch.cat([K[:, :2], K[:, 2:] - K.new_tensor([window.left, window.top, 0])[:, None]], 1)
+            K = torch.cat(
+                [K[:, :2], K[:, 2:] - K.new_tensor([window.left, window.top, 0])[:, None]], 1
+            )
         return View(K, self.viewmats[index], width, height)
 
     def _Ks_at(self, factor: int) -> Tensor:
@@ -182,7 +196,9 @@ class Views:
         return self.scaled_Ks[factor]
 
     def photo(self, index: int, window: Window | None = None) -> tuple[Tensor, Tensor | None]:
-        """The photo u8 [H, W, 3] of a view, or a window of it, and its mask bool [H, W]; None: all pixels count."""
+        """The photo u8 [H, W, 3] of a view, or a window of it, and its mask bool [H, W]; None: all
+        pixels count.
+        """
         image, mask = self.images[index], None if self.masks is None else self.masks[index]
         if window is None:
             return image, mask
@@ -190,10 +206,16 @@ class Views:
 
 
 def reduced(photo: Tensor, mask: Tensor | None, factor: int) -> tuple[Tensor, Tensor | None]:
-    """Colours [H, W, 3] in [0, 1] and mask [H, W] of a photo u8 at 1/factor; a pixel counts if all of it does."""
+    """Colours [H, W, 3] in [0, 1] and mask [H, W] of a photo u8 at 1/factor; a pixel counts if all
+    of it does.
+    """
     image = photo.float() / 255
     if factor > 1:
-        image = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0).contiguous()
+        image = (
+            torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), factor)
+            .permute(1, 2, 0)
+            .contiguous()
+        )
         if mask is not None:
             mask = -torch.nn.functional.max_pool2d(-mask[None].float(), factor)[0] > 0.5
     return image, mask

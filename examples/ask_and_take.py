@@ -1,4 +1,6 @@
-"""Ask a finished scene for a thing and take it out: python examples/ask_and_take.py work/office0 sofa sofa.ply"""
+"""Ask a finished scene for a thing and take it out: python examples/ask_and_take.py work/office0
+sofa sofa.ply
+"""
 
 import sys
 
@@ -15,7 +17,10 @@ def main(folder: str, word: str, out: str) -> None:
     part = scene.select(answer.selected)
     means, _ = part.points()
     low, high = means.min(0), means.max(0)
-    print(f"centres from {low.round(2).tolist()} to {high.round(2).tolist()}, scene units; {part.to_ply(out)}")
+    print(
+        f"centres from {low.round(2).tolist()} to {high.round(2).tolist()}, scene units; "
+        f"{part.to_ply(out)}"
+    )
 
 
 if __name__ == "__main__":

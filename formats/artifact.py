@@ -1,6 +1,7 @@
 """Artifacts on disk: published whole or not at all, described by a manifest, verified on reading.
 
-An artifact is a directory holding `artifact.json` and the files it lists. `publish` writes into a hidden
+An artifact is a directory holding `artifact.json` and the files it lists. `publish` writes into a
+hidden
 sibling, puts the manifest last, and renames: a reader sees a finished artifact or none.
 """
 
@@ -35,7 +36,9 @@ def is_published(path: Path) -> bool:
 
 
 def copy(path: Path, out: Path, manifest: Manifest) -> None:
-    """Publish the artifact `path`, whose manifest was read, at `out` as well. Raises InputError if it has changed."""
+    """Publish the artifact `path`, whose manifest was read, at `out` as well. Raises InputError if
+    it has changed.
+    """
     expected = manifest.files
     with publish(out, manifest) as tmp:
         for name in expected:
@@ -60,9 +63,10 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
     """Yield a scratch directory that becomes `out`, whole, when the block ends without an error.
 
     `manifest` may be completed inside the block (facts, seconds); its file table is filled in here.
-    A whole artifact that stands there, such as a twin's that was faster, is kept and ours is discarded, unless `force`
-    asks for ours. Until the block has ended, what stands at `out` stays.
-    Raises: InputError as `check_place`; ConfigError if there can be no `out`; DiskFailure if the disk takes no more.
+    A whole artifact that stands there, such as a twin's that was faster, is kept and ours is
+    discarded, unless `force` asks for ours. Until the block has ended, what stands at `out` stays.
+    Raises: InputError as `check_place`; ConfigError if there can be no `out`; DiskFailure if the
+      disk takes no more.
     """
     out = Path(out)
     tmp = out.parent / f".tmp-{out.name}-{os.getpid()}"
@@ -72,7 +76,9 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
             yield tmp
             if force or not is_whole(out, manifest.schema):
                 manifest.files = _settled(tmp)
-                (tmp / MANIFEST).write_text(json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n")
+                (tmp / MANIFEST).write_text(
+                    json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n"
+                )
                 sync(tmp / MANIFEST)
                 sync(tmp)
                 _put(tmp, out, manifest, force)
@@ -89,11 +95,15 @@ def _make(tmp: Path, out: Path) -> None:
     except OSError as error:
         if error.errno in REFUSALS:
             raise
-        raise ConfigError(f"{out} cannot be written ({error.strerror}); choose another --out") from None
+        raise ConfigError(
+            f"{out} cannot be written ({error.strerror}); choose another --out"
+        ) from None
 
 
 def _put(tmp: Path, out: Path, manifest: Manifest, force: bool) -> None:
-    """Rename `tmp` to `out`; what `check_place` lets be replaced is renamed before: no one sees half of either."""
+    """Rename `tmp` to `out`; what `check_place` lets be replaced is renamed before: no one sees
+    half of either.
+    """
     replaced = tmp.with_name(f".tmp-{out.name}-old-{os.getpid()}")
     try:
         os.rename(tmp, out)
@@ -112,26 +122,42 @@ def _put(tmp: Path, out: Path, manifest: Manifest, force: bool) -> None:
 
 
 def check_place(out: Path, schema: str, key: str, force: bool = False) -> None:
-    """Whether a stage may put its artifact at `out`, where nothing whole of it stands, or where `force` replaces it.
+    """Whether a stage may put its artifact at `out`, where nothing whole of it stands, or where
+    `force` replaces it.
 
-    Choices: a folder that bears the artifact's key is its own, whatever a crash has left of it. Elsewhere only an
-      artifact of the same schema goes, by `force`, and with nothing beside what its manifest lists.
+    Choices: a folder that bears the artifact's key is its own, whatever a crash has left of it.
+      Elsewhere only an artifact of the same schema goes, by `force`, and with nothing beside what
+      its manifest lists.
     Raises: InputError saying what stands there; nothing is removed.
     """
     if os.path.islink(out):
-        raise InputError(f"{out} is a link to {os.readlink(out)}: nothing was replaced; name that, or another --out")
-    if not os.path.lexists(out) or (os.path.isdir(out) and (out.name == key or not os.listdir(out))):
+        raise InputError(
+            f"{out} is a link to {os.readlink(out)}: nothing was replaced; name "
+            "that, or another --out"
+        )
+    if not os.path.lexists(out) or (
+        os.path.isdir(out) and (out.name == key or not os.listdir(out))
+    ):
         return
     if not is_published(out):
-        raise InputError(f"{out} exists and is not an artifact: nothing was replaced; choose another --out")
+        raise InputError(
+            f"{out} exists and is not an artifact: nothing was replaced; choose another --out"
+        )
     try:
         standing = parse_manifest(out)
     except InputError:  # it may be anyone's: nobody is told to delete it
-        raise InputError(f"{out / MANIFEST} is no manifest: nothing was replaced; choose another --out") from None
+        raise InputError(
+            f"{out / MANIFEST} is no manifest: nothing was replaced; choose another --out"
+        ) from None
     if standing.schema != schema:
-        raise InputError(f"{out} holds {standing.schema}, not {schema}: nothing was replaced; choose another --out")
+        raise InputError(
+            f"{out} holds {standing.schema}, not {schema}: nothing was replaced; "
+            "choose another --out"
+        )
     if extra := _unlisted(out, standing):
-        raise InputError(f"{out / extra[0]} is no part of the artifact: nothing was replaced; move it away")
+        raise InputError(
+            f"{out / extra[0]} is no part of the artifact: nothing was replaced; move it away"
+        )
     if not force:
         read_manifest(out, schema)
 
@@ -143,12 +169,21 @@ def read_manifest(path: Path, schema: str | None = None) -> Manifest:
     """
     path = Path(path)
     if not is_published(path):
-        raise InputError(f"{path / MANIFEST} is missing: not a finished artifact; run the stage that makes it again")
+        raise InputError(
+            f"{path / MANIFEST} is missing: not a finished artifact; run the stage "
+            "that makes it again"
+        )
     manifest = parse_manifest(path)
     if schema is not None and manifest.schema != schema:
         older = manifest.schema.rpartition("/")[0] == schema.rpartition("/")[0]
-        remedy = "another version of chebsplat made it: make it again" if older else "pass the right artifact"
-        raise InputError(f"{path / MANIFEST} has schema {manifest.schema}, expected {schema}; {remedy}")
+        remedy = (
+            "another version of chebsplat made it: make it again"
+            if older
+            else ("pass the right artifact")
+        )
+        raise InputError(
+            f"{path / MANIFEST} has schema {manifest.schema}, expected {schema}; {remedy}"
+        )
     for name, entry in manifest.files.items():
         member = os.path.join(path, name)
         try:
@@ -158,7 +193,9 @@ def read_manifest(path: Path, schema: str | None = None) -> Manifest:
         if state is None or not stat.S_ISREG(state.st_mode):
             raise InputError(f"{member} is missing; {remedy_of(path)}")
         if state.st_size != entry["bytes"]:
-            raise InputError(f"{member} has {state.st_size} bytes, expected {entry['bytes']}; {remedy_of(path)}")
+            raise InputError(
+                f"{member} has {state.st_size} bytes, expected {entry['bytes']}; {remedy_of(path)}"
+            )
     return manifest
 
 
@@ -169,7 +206,9 @@ def verify(path: Path, schema: str | None = None) -> Manifest:
     for name in manifest.files:
         checked(path, manifest, name)
     if extra := _unlisted(path, manifest):
-        raise InputError(f"{path / extra[0]} is not listed in {MANIFEST} ({len(extra)} such); {remedy_of(path)}")
+        raise InputError(
+            f"{path / extra[0]} is not listed in {MANIFEST} ({len(extra)} such); {remedy_of(path)}"
+        )
     return manifest
 
 
@@ -177,7 +216,9 @@ def checked(path: Path, manifest: Manifest, name: str) -> Path:
     """Path of one listed file after comparing its digest. Raises InputError if it differs."""
     entry = manifest.files.get(name)
     if entry is None:
-        raise InputError(f"{path / name} is not part of this {manifest.schema} artifact; {remedy_of(path)}")
+        raise InputError(
+            f"{path / name} is not part of this {manifest.schema} artifact; {remedy_of(path)}"
+        )
     if sha256_file(path / name) != entry["sha256"]:
         raise InputError(f"{path / name} does not match its sha256; {remedy_of(path)}")
     return path / name
@@ -196,8 +237,8 @@ def _entry(path: Path) -> dict[str, Any]:
 
 
 def _settled(root: Path) -> dict[str, dict[str, Any]]:
-    """Make files outlive a power cut, and as readable as the user's umask has made their folder (some writers give a
-    file to its owner alone); returns their sizes and digests by name.
+    """Make files outlive a power cut, and as readable as the user's umask has made their folder
+    (some writers give a file to its owner alone); returns their sizes and digests by name.
 
     Choices: eight at a time, since a disk writes many files in little more time than one.
     """
@@ -219,7 +260,9 @@ def digest(value: Mapping[str, Any]) -> str:
 
 
 def discard(scratch: Path) -> None:
-    """Remove a scratch directory. Raises ValueError if it is none: nothing of the user's is ever removed."""
+    """Remove a scratch directory. Raises ValueError if it is none: nothing of the user's is ever
+    removed.
+    """
     if not scratch.name.startswith((".part-", ".tmp-")):
         raise ValueError(f"{scratch} is no scratch directory")
     if scratch.exists():
@@ -227,8 +270,12 @@ def discard(scratch: Path) -> None:
 
 
 def write_document(path: Path, value: Any) -> None:
-    """Write `value` as JSON. Raises ValueError on a value JSON or UTF-8 does not have, nan among them."""
-    path.write_text(json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+    """Write `value` as JSON. Raises ValueError on a value JSON or UTF-8 does not have, nan among
+    them.
+    """
+    path.write_text(
+        json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
 
 
 def read_document(root: Path, manifest: Manifest, name: str) -> Any:

@@ -1,4 +1,6 @@
-"""`NAME.relevancy.json` beside a teacher's `NAME.onnx`: what its relevancy means, and the rooms that say so."""
+"""`NAME.relevancy.json` beside a teacher's `NAME.onnx`: what its relevancy means, and the rooms
+that say so.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +34,9 @@ class Document(TypedDict):
 
 @dataclass(frozen=True)
 class TeacherCalibration:
-    """teacher, sha256: the model that it is of; rivals: words that any other is weighed against; calibration: the
-    coefficients of `labels.calibration.Calibration` by name; made: rooms, views, words and figures on rooms left out.
+    """teacher, sha256: the model that it is of; rivals: words that any other is weighed against;
+    calibration: the coefficients of `labels.calibration.Calibration` by name; made: rooms, views,
+      words and figures on rooms left out.
     """
 
     teacher: str
@@ -55,7 +58,8 @@ def write_calibration(path: Path, of: TeacherCalibration) -> None:
 
 
 def calibration_of(model: Path) -> TeacherCalibration | None:
-    """What lies beside a teacher's .onnx, or beside the embedded teacher where that is the same file elsewhere.
+    """What lies beside a teacher's .onnx, or beside the embedded teacher where that is the same
+    file elsewhere.
 
     Raises: as `read_calibration`.
     """
@@ -67,7 +71,8 @@ def calibration_of(model: Path) -> TeacherCalibration | None:
 def read_calibration(model: Path) -> TeacherCalibration | None:
     """That of a teacher's .onnx; None where there is none.
 
-    Raises: InputError naming the file where it is damaged, or of another model than the one beside it.
+    Raises: InputError naming the file where it is damaged, or of another model than the one beside
+      it.
     """
     path = beside(model)
     if not path.is_file():

@@ -15,7 +15,9 @@ RIGID = 1e-3  # largest entry of |RRᵀ − I|
 
 @dataclass
 class Cameras(Record):
-    """names of V views; Ks f64 [V, 3, 3] pixels of a width x height image; cam_from_world f64 [V, 4, 4]."""
+    """names of V views; Ks f64 [V, 3, 3] pixels of a width x height image; cam_from_world f64 [V,
+    4, 4].
+    """
 
     names: list[str]
     Ks: Annotated[np.ndarray, Array("float64", ("view", 3, 3), "pixels")]
@@ -24,14 +26,26 @@ class Cameras(Record):
     height: int
 
 
-def check_cameras(names: list[str], Ks: np.ndarray, poses: np.ndarray | None, where: object, remedy: str) -> None:
-    """Raise InputError naming the first view whose camera cannot be used; poses [V, 4, 4] of a world, or None."""
+def check_cameras(
+    names: list[str], Ks: np.ndarray, poses: np.ndarray | None, where: object, remedy: str
+) -> None:
+    """Raise InputError naming the first view whose camera cannot be used; poses [V, 4, 4] of a
+    world, or None.
+    """
     for what, data in (("Ks", Ks), ("poses", poses)):
         if data is not None and len(data) != len(names):
             raise InputError(f"{where}: {len(data)} {what} for {len(names)} views; {remedy}")
-    usable = np.isfinite(Ks).all((1, 2)) & (Ks[:, 0, 0] > 0) & (Ks[:, 1, 1] > 0) & (Ks[:, 2] == [0, 0, 1]).all(1)
+    usable = (
+        np.isfinite(Ks).all((1, 2))
+        & (Ks[:, 0, 0] > 0)
+        & (Ks[:, 1, 1] > 0)
+        & (Ks[:, 2] == [0, 0, 1]).all(1)
+    )
     if not usable.all():
-        raise InputError(f"{where}: the intrinsics of {names[int(np.argmin(usable))]} are not a camera's; {remedy}")
+        raise InputError(
+            f"{where}: the intrinsics of {names[int(np.argmin(usable))]} are not a "
+            f"camera's; {remedy}"
+        )
     if poses is None:
         return
     rotations = np.nan_to_num(poses[:, :3, :3], nan=np.inf).clip(-2, 2)
@@ -39,4 +53,6 @@ def check_cameras(names: list[str], Ks: np.ndarray, poses: np.ndarray | None, wh
     rigid = (off < RIGID) & (np.linalg.det(rotations) > 0) & np.isfinite(poses).all((1, 2))
     rigid &= (poses[:, 3] == [0, 0, 0, 1]).all(1)
     if not rigid.all():
-        raise InputError(f"{where}: the pose of {names[int(np.argmin(rigid))]} is not a rotation; {remedy}")
+        raise InputError(
+            f"{where}: the pose of {names[int(np.argmin(rigid))]} is not a rotation; {remedy}"
+        )

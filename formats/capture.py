@@ -1,4 +1,6 @@
-"""`capture/2`: what was photographed. Images and cameras; depth, labels and loss masks where the source has them."""
+"""`capture/2`: what was photographed. Images and cameras; depth, labels and loss masks where the
+source has them.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +28,17 @@ class Capture(Record):
     Ks:             f64 [V, 3, 3] pixels, pixel centres at half integers (COLMAP).
     cam_from_world: f64 [V, 4, 4] OpenCV axes, or None where poses are unknown.
     is_test:        bool [V]; test views are never trained on.
-    depth, labels, pseudo_labels, confidence, loss_mask: of each pixel, or None. class_names[labels] names a pixel.
-    points:         f32 [N, 3] in the world, where the source has its own, with point_colors u8 [N, 3] or None, and
+    depth, labels, pseudo_labels, confidence, loss_mask: of each pixel, or None. class_names[labels]
+      names a pixel.
+    points:         f32 [N, 3] in the world, where the source has its own, with point_colors u8 [N,
+      3] or None, and
                     tracks i32 [T, 2] (point, view), who sees them, or None.
-    taken:          u8 [T, H', W', 3], test photos that are undistorted or reduced, as they were taken, to 1600
-                    pixels, or None; lenses: of each the view's name, COLMAP's model and parameters, width and height.
-    source:         which source, and notes about what was dropped or changed; protocol: name and parameters.
+    taken:          u8 [T, H', W', 3], test photos that are undistorted or reduced, as they were
+      taken, to 1600
+                    pixels, or None; lenses: of each the view's name, COLMAP's model and parameters,
+                    width and height.
+    source:         which source, and notes about what was dropped or changed; protocol: name and
+      parameters.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.capture/2"
@@ -41,21 +48,33 @@ class Capture(Record):
     cam_from_world: Annotated[np.ndarray | None, Array("float64", ("view", 4, 4), "scene units")]
     is_test: Annotated[np.ndarray, Array("bool", ("view",))]
     depth: Annotated[
-        Stack | None, Array("float32", PIXELS, "scene units, z; nan unknown", by_view=True, any_value=True)
+        Stack | None,
+        Array("float32", PIXELS, "scene units, z; nan unknown", by_view=True, any_value=True),
     ] = None
-    labels: Annotated[Stack | None, Array("int16", PIXELS, "class index, -1 ignored", by_view=True)] = None
-    loss_mask: Annotated[Stack | None, Array("bool", PIXELS, "true where a pixel counts", by_view=True)] = None
+    labels: Annotated[
+        Stack | None, Array("int16", PIXELS, "class index, -1 ignored", by_view=True)
+    ] = None
+    loss_mask: Annotated[
+        Stack | None, Array("bool", PIXELS, "true where a pixel counts", by_view=True)
+    ] = None
     class_names: list[str] | None = None
     source: dict[str, Any] = field(default_factory=dict)
     protocol: dict[str, Any] = field(default_factory=dict)
     points: Annotated[np.ndarray | None, Array("float32", ("point", 3), "scene units")] = None
     point_colors: Annotated[np.ndarray | None, Array("uint8", ("point", 3), "sRGB")] = None
     pseudo_labels: Annotated[
-        Stack | None, Array("int16", PIXELS, "class index that a 2D network gave, -1 none", by_view=True)
+        Stack | None,
+        Array("int16", PIXELS, "class index that a 2D network gave, -1 none", by_view=True),
     ] = None
-    confidence: Annotated[Stack | None, Array("float16", PIXELS, "of the pseudo labels, 0 to 1", by_view=True)] = None
-    tracks: Annotated[np.ndarray | None, Array("int32", ("observation", 2), "index of a point, of a view")] = None
-    taken: Annotated[Stack | None, Array("uint8", ("photo", "its row", "its column", 3), "sRGB", by_view=True)] = None
+    confidence: Annotated[
+        Stack | None, Array("float16", PIXELS, "of the pseudo labels, 0 to 1", by_view=True)
+    ] = None
+    tracks: Annotated[
+        np.ndarray | None, Array("int32", ("observation", 2), "index of a point, of a view")
+    ] = None
+    taken: Annotated[
+        Stack | None, Array("uint8", ("photo", "its row", "its column", 3), "sRGB", by_view=True)
+    ] = None
     lenses: list[list[Any]] = field(default_factory=list)
 
     @property
@@ -64,7 +83,9 @@ class Capture(Record):
         return self.images.shape[2], self.images.shape[1]
 
     def write(self, out: Path) -> None:
-        """Fill the directory that `artifact.publish` yields. Raises InputError if the views do not fit together."""
+        """Fill the directory that `artifact.publish` yields. Raises InputError if the views do not
+        fit together.
+        """
         _check(self)
         super().write(out)
 
@@ -77,8 +98,12 @@ def _check(capture: Capture) -> None:
         check_names(capture.class_names, "class names", where, remedy)
     if len(capture.images) != n_views:
         raise InputError(f"{where}: {len(capture.images)} images for {n_views} views; {remedy}")
-    if (capture.labels is not None or capture.pseudo_labels is not None) and not capture.class_names:
-        raise InputError(f"{where}: labels without class names; name them in scene.json or labels.json")
+    if (
+        capture.labels is not None or capture.pseudo_labels is not None
+    ) and not capture.class_names:
+        raise InputError(
+            f"{where}: labels without class names; name them in scene.json or labels.json"
+        )
     check_cameras(capture.names, capture.Ks, capture.cam_from_world, where, remedy)
     if points is None or tracks is None or not len(tracks):
         return

@@ -1,4 +1,6 @@
-"""`channels/2`: the linear map from a teacher's channels to the fewer that scenes are trained in."""
+"""`channels/2`: the linear map from a teacher's channels to the fewer that scenes are trained
+in.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +14,15 @@ from chebsplat.formats.record import Array, Record
 
 @dataclass
 class ChannelMap(Record):
-    """The linear map from a teacher's C channels to d; one for all scenes, computed by `chebsplat.labels.channels`.
+    """The linear map from a teacher's C channels to d; one for all scenes, computed by
+    `chebsplat.labels.channels`.
 
     matrix:  f32 [C, d] orthonormal columns, of falling weight.
     inverse: f32 [d, C], back to the teacher's channels.
     energy:  f32 [C] share of the reference's squared length that the first k + 1 directions hold.
     teacher: its name.
-    notes:   the teacher's digest, what the reference was, numbers of its pixels and of the vocabulary's words.
+    notes:   the teacher's digest, what the reference was, numbers of its pixels and of the
+      vocabulary's words.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.channels/2"
@@ -36,8 +40,8 @@ class ChannelMap(Record):
     def embed(self, embeddings: np.ndarray) -> np.ndarray:
         """Unit embeddings [L, C] of words -> f32 [L, d].
 
-        Choices: not made unit again, so that an inner product with mapped features is the teacher's own; unit
-          rows would favour the words that the reference shows least.
+        Choices: not made unit again, so that an inner product with mapped features is the teacher's
+          own; unit rows would favour the words that the reference shows least.
         """
         embedded: np.ndarray = np.asarray(embeddings, np.float32) @ self.matrix
         return embedded

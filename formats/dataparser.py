@@ -1,4 +1,6 @@
-"""nerfstudio's dataparser_transforms.json: how the cameras were moved and scaled that a splat was trained by."""
+"""nerfstudio's dataparser_transforms.json: how the cameras were moved and scaled that a splat was
+trained by.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ def beside(ply: Path) -> Path | None:
 
 
 def read_dataparser(path: Path) -> tuple[float, np.ndarray, np.ndarray]:
-    """scale, rotation [3, 3] and shift [3]: x' = scale (rotation x + shift). Raises InputError naming the file."""
+    """scale, rotation [3, 3] and shift [3]: x' = scale (rotation x + shift). Raises InputError
+    naming the file.
+    """
     document = parse_json(path)
     try:
         matrix, scale = np.array(document["transform"], float), float(document["scale"])
@@ -28,5 +32,8 @@ def read_dataparser(path: Path) -> tuple[float, np.ndarray, np.ndarray]:
         matrix, scale = np.zeros(0), 0.0
     rotation = matrix[:3, :3] if matrix.shape in ((3, 4), (4, 4)) else np.zeros((3, 3))
     if not (np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and 0 < scale < np.inf):
-        raise InputError(f"{path} holds no `transform` of 3x4 and `scale`; remove it, or copy it again from nerfstudio")
+        raise InputError(
+            f"{path} holds no `transform` of 3x4 and `scale`; remove it, or copy it "
+            "again from nerfstudio"
+        )
     return scale, rotation, matrix[:3, 3]

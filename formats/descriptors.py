@@ -1,4 +1,6 @@
-"""`descriptors/2`: points of a scene's surface, and the shape about each: what the point encoder sees."""
+"""`descriptors/2`: points of a scene's surface, and the shape about each: what the point encoder
+sees.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +17,23 @@ class Descriptors(Record):
     """N points; their frame is the scene's turned upright, z up, in metres, about `origin`.
 
     own, means, normals, descriptors, neighbors: as in `shape.point_inputs.PointInputs`.
-    origin: [3] scene units; up: [3] against gravity, in the scene's frame; unit: scene units in a metre.
-    notes:  whose surface it is, how sure up is, what the unit comes from; why there is no point, where there is none.
+    origin: [3] scene units; up: [3] against gravity, in the scene's frame; unit: scene units in a
+      metre.
+    notes:  whose surface it is, how sure up is, what the unit comes from; why there is no point,
+      where there is none.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.descriptors/2"
-    own: Annotated[np.ndarray, Array("float32", ("point", "number"), "metres, none, none, none, none, log of metres")]
+    own: Annotated[
+        np.ndarray,
+        Array("float32", ("point", "number"), "metres, none, none, none, none, log of metres"),
+    ]
     means: Annotated[np.ndarray, Array("float32", ("point", 3), "metres")]
     normals: Annotated[np.ndarray, Array("float32", ("point", 3))]
     descriptors: Annotated[np.ndarray, Array("float32", ("point", "value"))]
-    neighbors: Annotated[np.ndarray, Array("int32", ("point", "radius", "neighbor"), "index of a point, -1 none")]
+    neighbors: Annotated[
+        np.ndarray, Array("int32", ("point", "radius", "neighbor"), "index of a point, -1 none")
+    ]
     origin: list[float]
     up: list[float]
     unit: float

@@ -12,7 +12,8 @@ from chebsplat.formats.record import Array, Record
 
 @dataclass
 class Encoding(Record):
-    """features: f16 [N, p] of the points of a `descriptors` artifact, in their order; the last is 1.
+    """features: f16 [N, p] of the points of a `descriptors` artifact, in their order; the last is
+    1.
     notes: why there is no point, where there is none.
     """
 

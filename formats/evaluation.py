@@ -1,5 +1,6 @@
 """`evaluation/2`: figures per view and per class, rendered pictures, timings;
-`agreement/2`: how far the views of a capture agree on what the same points are, by their 2D teacher.
+`agreement/2`: how far the views of a capture agree on what the same points are, by their 2D
+  teacher.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ class Evaluation:
     pictures: dict[str, Stack] = field(default_factory=dict)
 
     def write(self, out: Path) -> None:
-        """Fill the directory that `artifact.publish` yields. Raises ValueError on a figure that is nan or infinite."""
+        """Fill the directory that `artifact.publish` yields. Raises ValueError on a figure that is
+        nan or infinite.
+        """
         write_document(out / FIGURES, self.figures)
         Pictures(**self.pictures).write(out)
 
@@ -47,7 +50,9 @@ class Evaluation:
 
 @dataclass
 class Pictures(Record):
-    """Of the test views: `truth`, `renders` u8 [V, H, W, 3]; maps i16 [V, H, W] of labels, -1 none."""
+    """Of the test views: `truth`, `renders` u8 [V, H, W, 3]; maps i16 [V, H, W] of labels, -1
+    none.
+    """
 
     SCHEMA: ClassVar[str] = Evaluation.SCHEMA
     truth: Annotated[Stack | None, Array("uint8", (*PIXELS, 3), "sRGB", by_view=True)] = None
@@ -64,9 +69,18 @@ def read_figures(path: Path, manifest: Manifest) -> dict[str, Any]:
 
 
 def rests(segmentation: Any, figure: str = "miou") -> str:
-    """How many classes and pixels (or points) of truth a mIoU rests on, in words; empty where it is not known."""
+    """How many classes and pixels (or points) of truth a mIoU rests on, in words; empty where it is
+    not known.
+    """
     of = segmentation.get("counted", {}).get(figure)
-    return f"{of['classes']} classes, {of['pixels']:,} {'points' if figure == 'point_miou' else 'pixels'}" if of else ""
+    return (
+        (
+            f"{of['classes']} classes, {of['pixels']:,} "
+            f"{'points' if figure == 'point_miou' else 'pixels'}"
+        )
+        if of
+        else ""
+    )
 
 
 @dataclass
@@ -74,7 +88,8 @@ class ViewAgreement(Record):
     """agreement: 1 if views always agree, 0 if by chance alone, None where no point was seen twice.
 
     n_points: that two of the `n_views` training views see.
-    labels:   by name, of those that are said at all: `share` of what views say, and the `agreement` of the views on
+    labels:   by name, of those that are said at all: `share` of what views say, and the `agreement`
+      of the views on
               this label.
     """
 

@@ -1,4 +1,6 @@
-"""`features/2`: per-view semantic features of a 2D teacher, and the labels they can be asked for."""
+"""`features/2`: per-view semantic features of a 2D teacher, and the labels they can be asked
+for.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +28,12 @@ class Features(Record):
 
     names:            of the views, for joins.
     features:         f16 [V, h, w, C].
-    label_names:      L names; label_embeddings: f32 [L, C], no row longer than 1; a pixel's label is the one of the
+    label_names:      L names; label_embeddings: f32 [L, C], no row longer than 1; a pixel's label
+      is the one of the
                       largest inner product. Rows are unit unless `channels` keeps a part of them.
     pseudo_labels:    i16 [V, h, w] or None; confidence: f16 [V, h, w] in [0, 1] or None.
-    convention:       n_scales, flips, normalized and the teacher's own parameters: a loss needs to know them.
+    convention:       n_scales, flips, normalized and the teacher's own parameters: a loss needs to
+      know them.
     channels:         from the teacher's channels to these C; None: they are the teacher's own.
     """
 
@@ -38,22 +42,26 @@ class Features(Record):
     features: Annotated[Stack, Array("float16", (*PIXELS, "channel"), by_view=True)]
     label_names: list[str]
     label_embeddings: Annotated[np.ndarray, Array("float32", ("label", "channel"))]
-    pseudo_labels: Annotated[Stack | None, Array("int16", PIXELS, "label index, -1 none", by_view=True)] = None
+    pseudo_labels: Annotated[
+        Stack | None, Array("int16", PIXELS, "label index, -1 none", by_view=True)
+    ] = None
     confidence: Annotated[Stack | None, Array("float16", PIXELS, "0 to 1", by_view=True)] = None
     convention: dict[str, Any] = field(default_factory=dict)
     channels: ChannelMap | None = None
 
 
 class FeatureWriter:
-    """Writes one view at a time, in any order, into a folder that survives a kill; the same bytes however often.
+    """Writes one view at a time, in any order, into a folder that survives a kill; the same bytes
+    however often.
 
-    A view is done once a mark says so, and the mark is written when the view's files are safe on disk. Whatever a kill
-    left of another view is written anew.
+    A view is done once a mark says so, and the mark is written when the view's files are safe on
+    disk. Whatever a kill left of another view is written anew.
 
     Args:
       folder:    of this writer alone, on the disk of the artifact that `finish` fills.
       names:     of the V views; shape: (h, w, C) of each.
-      made_with: what else the values depend on; a folder made with other names, shape or settings starts anew.
+      made_with: what else the values depend on; a folder made with other names, shape or settings
+        starts anew.
     """
 
     def __init__(
@@ -64,7 +72,9 @@ class FeatureWriter:
         made_with: Mapping[str, Any] | None = None,
     ):
         self.folder, self.names, self.shape = Path(folder), list(names), shape
-        wanted = json.dumps({"names": self.names, "shape": list(shape), "made_with": dict(made_with or {})})
+        wanted = json.dumps(
+            {"names": self.names, "shape": list(shape), "made_with": dict(made_with or {})}
+        )
         state = self.folder / "writer.json"
         if not state.is_file() or state.read_text() != wanted:
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -74,7 +84,9 @@ class FeatureWriter:
         self._holds: dict[int, list[str]] = {}  # view -> names of its arrays
         for mark in (self.folder / "done").iterdir():
             held = mark.read_text().split()
-            if mark.name.isdigit() and all(self._file(name, int(mark.name)).is_file() for name in held):
+            if mark.name.isdigit() and all(
+                self._file(name, int(mark.name)).is_file() for name in held
+            ):
                 self._holds[int(mark.name)] = held
 
     @property
@@ -98,12 +110,16 @@ class FeatureWriter:
         for name, value in values.items():
             array = self._array(name)
             if value.shape != array.shape[1:]:
-                raise ValueError(f"view {self.names[view]}: {name} {value.shape}, expected {array.shape[1:]}")
+                raise ValueError(
+                    f"view {self.names[view]}: {name} {value.shape}, expected {array.shape[1:]}"
+                )
             with np.errstate(over="ignore"):  # reported below
                 stored = value.astype(array.dtype, copy=False)
             if stored.dtype.kind == "f" and not np.isfinite(stored).all():
                 bad = np.sum(~np.isfinite(stored))
-                raise ValueError(f"view {self.names[view]}: {name} hold {bad} non-finite values in float16")
+                raise ValueError(
+                    f"view {self.names[view]}: {name} hold {bad} non-finite values in float16"
+                )
             array[view] = stored
             sync(self._file(name, view))
         atomic_write(self.folder / "done" / str(view), " ".join(values))
@@ -117,10 +133,11 @@ class FeatureWriter:
         convention: dict[str, Any],
         channels: ChannelMap | None = None,
     ) -> Features:
-        """Fill the directory that `artifact.publish` yields, and return what it holds; the writer's own
-        folder stays as it is.
+        """Fill the directory that `artifact.publish` yields, and return what it holds; the writer's
+        own folder stays as it is.
 
-        Raises: ValueError naming a view that was not added, or was added without its labels or confidence.
+        Raises: ValueError naming a view that was not added, or was added without its labels or
+          confidence.
         """
         absent = [name for view, name in enumerate(self.names) if view not in self._holds]
         if absent:
@@ -136,12 +153,21 @@ class FeatureWriter:
             _link(self.folder / name / METADATA, out / name / METADATA)
         check_names(label_names, "label names", "features", "correct the labels")
         fixed = (label_names, label_embeddings)
-        made = Features(self.names, stored.pop("features"), *fixed, **stored, convention=convention, channels=channels)
+        made = Features(
+            self.names,
+            stored.pop("features"),
+            *fixed,
+            **stored,
+            convention=convention,
+            channels=channels,
+        )
         made.write(out)
         return made
 
     def _array(self, name: str) -> Any:
-        """The open array. Metadata are written anew, always the same; what chunks there are stay."""
+        """The open array. Metadata are written anew, always the same; what chunks there are
+        stay.
+        """
         if name not in self._arrays:
             spec = layout_of(Features).arrays[name]
             shape = (len(self.names), *self.shape)[: len(spec.axes)]
@@ -156,7 +182,9 @@ class FeatureWriter:
 
 
 def _link(source: Path, target: Path) -> None:
-    """A second name for a file: no bytes are copied, and a kill before publication loses no view."""
+    """A second name for a file: no bytes are copied, and a kill before publication loses no
+    view.
+    """
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target)

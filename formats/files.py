@@ -1,8 +1,10 @@
-"""Files one by one. Reading what people or other programs wrote: regular, of bounded size, UTF-8, and parsed or named
-in a clear error. Writing a file whole or not at all; a disk that is full, over quota or read-only said in one line.
+"""Files one by one. Reading what people or other programs wrote: regular, of bounded size, UTF-8,
+and parsed or named in a clear error. Writing a file whole or not at all; a disk that is full, over
+quota or read-only said in one line.
 
-Every reader of such a file goes through here, so that a pipe, a device, a folder, a file of gigabytes, bytes that are
-no text and a document nested a thousand levels deep are each refused at once, in the same words everywhere.
+Every reader of such a file goes through here, so that a pipe, a device, a folder, a file of
+gigabytes, bytes that are no text and a document nested a thousand levels deep are each refused at
+once, in the same words everywhere.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from typing import Any
 
 from chebsplat.errors import ChebsplatError, DiskFailure, InputError
 
-LARGEST = 32 << 20  # bytes of text: a transforms.json of 20,000 frames; as JSON it takes up to 25 times as much memory
+# bytes of text: a transforms.json of 20,000 frames; as JSON it takes up to 25 times as much memory
+LARGEST = 32 << 20
 LARGEST_TOML = 1 << 20  # tomllib reads about 2 MB a second
 RESTORE = "restore the file"
 # tomllib takes quadratic time over a dotted key; none of ours has more than four parts
@@ -31,10 +34,13 @@ ENDLESS_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){64}""")
 SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 CLOSED = {errno.EROFS, errno.EACCES, errno.EPERM}
 REFUSALS = {errno.ENOSPC, errno.EDQUOT} | CLOSED
-OUTPUT = "standard output"  # the name of the file in an error of writing it (`stages.runtime.stopping.streams`)
+# the name of the file in an error of writing it (`stages.runtime.stopping.streams`)
+OUTPUT = "standard output"
 
 
-def regular(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError) -> os.stat_result:
+def regular(
+    path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError
+) -> os.stat_result:
     """Size and time of a regular file, links followed; anything else would block, or never end."""
     try:
         state = os.stat(path)
@@ -49,7 +55,10 @@ def regular(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = Inp
 
 
 def read_text(
-    path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError, largest: int = LARGEST
+    path: Path,
+    remedy: str = RESTORE,
+    error: type[ChebsplatError] = InputError,
+    largest: int = LARGEST,
 ) -> str:
     """The text of a regular UTF-8 file. Raises `error` naming the file and the remedy."""
     if (size := regular(path, remedy, error).st_size) > largest:
@@ -63,14 +72,22 @@ def read_text(
 
 
 def parse_json(
-    path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError, finite: bool = False
+    path: Path,
+    remedy: str = RESTORE,
+    error: type[ChebsplatError] = InputError,
+    finite: bool = False,
 ) -> Any:
-    """The value in a JSON file; `finite`: without nan or infinities, as JSON really is. Raises `error`."""
+    """The value in a JSON file; `finite`: without nan or infinities, as JSON really is. Raises
+    `error`.
+    """
     text = read_text(path, remedy, error)
     try:
-        strict: dict[str, Any] = {"parse_constant": _finite, "parse_float": _finite} if finite else {}
+        strict: dict[str, Any] = (
+            {"parse_constant": _finite, "parse_float": _finite} if finite else {}
+        )
         value = json.loads(text, object_pairs_hook=_once, **strict)
-        if SURROGATE.search(text):  # half a character: it could be printed, hashed or written nowhere
+        # half a character: it could be printed, hashed or written nowhere
+        if SURROGATE.search(text):
             json.dumps(value, ensure_ascii=False).encode()
     except RecursionError:
         raise error(f"{path} is nested too deeply; {remedy}") from None
@@ -80,7 +97,9 @@ def parse_json(
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object whose keys differ: of two values of one key neither is what its writer meant."""
+    """A JSON object whose keys differ: of two values of one key neither is what its writer
+    meant.
+    """
     value = dict(pairs)
     if len(value) < len(pairs):
         twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
@@ -94,7 +113,9 @@ def _finite(text: str) -> float:
     return value
 
 
-def parse_toml(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError) -> dict[str, Any]:
+def parse_toml(
+    path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = InputError
+) -> dict[str, Any]:
     """The table in a TOML file. Raises `error`."""
     text = read_text(path, remedy, error, LARGEST_TOML)
     try:
@@ -109,10 +130,12 @@ def parse_toml(path: Path, remedy: str = RESTORE, error: type[ChebsplatError] = 
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, which a block fills; it becomes `path` when the block ends without an error.
+    """A temporary path beside `path`, which a block fills; it becomes `path` when the block ends
+    without an error.
 
-    The file is there whole or not at all, whatever happens to the machine. A block that fails leaves what stood there
-    before. The temporary name keeps the ending, by which some libraries choose a format.
+    The file is there whole or not at all, whatever happens to the machine. A block that fails
+    leaves what stood there before. The temporary name keeps the ending, by which some libraries
+    choose a format.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
@@ -164,22 +187,35 @@ def explained(folder: Path, scratch: bool = False) -> Iterator[None]:
 def _failure(fault: OSError, folder: Path, scratch: bool) -> ChebsplatError:
     if fault.filename == OUTPUT:
         return DiskFailure(
-            f"{OUTPUT} cannot be written ({fault.strerror}); make room where it goes, or send it elsewhere"
+            f"{OUTPUT} cannot be written ({fault.strerror}); make room where it goes, or send it "
+            "elsewhere"
         )
     file = Path(os.fsdecode(fault.filename)) if isinstance(fault.filename, str | bytes) else folder
     if fault.errno in CLOSED:
         if file.exists() and not os.access(file, os.R_OK):
-            return InputError(f"{file} cannot be read ({fault.strerror}); allow it, or name another")
-        return DiskFailure(f"{file} cannot be written ({fault.strerror}); make it writable, or choose another folder")
+            return InputError(
+                f"{file} cannot be read ({fault.strerror}); allow it, or name another"
+            )
+        return DiskFailure(
+            f"{file} cannot be written ({fault.strerror}); make it writable, or "
+            "choose another folder"
+        )
     there = next(parent for parent in (folder, *folder.parents) if parent.is_dir())
     disk, free = os.statvfs(there), shutil.disk_usage(there).free
-    written = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if scratch else 0
+    written = (
+        sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) if scratch else 0
+    )
     if fault.errno == errno.EDQUOT:
         why = f"your quota is used up, though {free:,} bytes are free; remove files of yours"
     elif disk.f_files and not disk.f_favail:
         why = f"{there} holds as many files as it can; remove some, however small,"
     elif written:
-        why = f"more than {written:,} bytes are needed in {folder.parent}, {free:,} are free beside those; make room"
+        why = (
+            f"more than {written:,} bytes are needed in {folder.parent}, {free:,} are free "
+            "beside those; make room"
+        )
     else:
         why = f"{free:,} bytes are free in {there}, and more are needed; make room"
-    return DiskFailure(f"{file} cannot be written ({fault.strerror}): {why} and give the same command again")
+    return DiskFailure(
+        f"{file} cannot be written ({fault.strerror}): {why} and give the same command again"
+    )

@@ -1,6 +1,8 @@
-"""Images from outside: the one door to Pillow's readers. PNG, JPEG and HEIC, recognised by content, of bounded size.
+"""Images from outside: the one door to Pillow's readers. PNG, JPEG and HEIC, recognised by content,
+of bounded size.
 
-Pillow would read forty more formats, whatever a file is called; one of its readers starts Ghostscript.
+Pillow would read forty more formats, whatever a file is called; one of its readers starts
+Ghostscript.
 """
 
 from __future__ import annotations
@@ -26,8 +28,10 @@ if TYPE_CHECKING:
 
 FORMATS = ("PNG", "JPEG")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif")
-HEIC_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}  # ISO/IEC 23008-12
-MAX_PIXELS = 64_000_000  # of one image, and of all that are being decoded: that takes up to 12 bytes a pixel
+# ISO/IEC 23008-12
+HEIC_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}
+# of one image, and of all that are being decoded: that takes up to 12 bytes a pixel
+MAX_PIXELS = 64_000_000
 MAX_SIDE = 65_535  # what JPEG can hold
 INCOMPLETE = "the source is incomplete"
 # What Pillow raises on damaged pixels, and struct and its own parsers on damaged EXIF.
@@ -44,7 +48,9 @@ def is_image(name: str) -> bool:
 
 
 def images_below(folder: Path, remedy: str) -> list[Path]:
-    """The images of a folder and those below it, sorted. Raises InputError, which ends in the remedy, without any."""
+    """The images of a folder and those below it, sorted. Raises InputError, which ends in the
+    remedy, without any.
+    """
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not files:
         raise InputError(f"{folder} holds no .png or .jpg image; {remedy}")
@@ -65,18 +71,23 @@ def require_heic(path: Path) -> None:
         import_module("pillow_heif")
     except ImportError:
         raise InputError(
-            f"{path} is a HEIC photo, which the package pillow_heif reads: .venv/bin/pip install -e '.[heic]' installs "
+            f"{path} is a HEIC photo, which the package pillow_heif reads: .venv/bin/pip install "
+            "-e '.[heic]' installs "
             "it"
         ) from None
 
 
 @contextmanager
-def opened(path: Path, remedy: str = INCOMPLETE, check: Callable[[Any], None] | None = None) -> Iterator[Any]:
-    """A decoded PIL image, for as long as a `with` block needs all of its pixels; `check` sees it before it is decoded.
+def opened(
+    path: Path, remedy: str = INCOMPLETE, check: Callable[[Any], None] | None = None
+) -> Iterator[Any]:
+    """A decoded PIL image, for as long as a `with` block needs all of its pixels; `check` sees it
+    before it is decoded.
 
-    Choices: threads decode at once what fits into MAX_PIXELS together, and a larger photo waits for the others, so
-      that blocks must not be nested.
-    Raises:  InputError if it is missing (with that remedy), damaged, too large or of another format.
+    Choices: threads decode at once what fits into MAX_PIXELS together, and a larger photo waits for
+      the others, so that blocks must not be nested.
+    Raises:  InputError if it is missing (with that remedy), damaged, too large or of another
+      format.
     """
     with ExitStack() as pixels:
 
@@ -96,7 +107,9 @@ def read_rgb(path: Path, remedy: str = INCOMPLETE) -> np.ndarray:
 
 
 def header(path: Path, remedy: str = INCOMPLETE) -> tuple[tuple[int, int], float | None]:
-    """(width, height) as the photo is meant to be seen, and its 35 mm focal length if it says so; decodes no pixel."""
+    """(width, height) as the photo is meant to be seen, and its 35 mm focal length if it says so;
+    decodes no pixel.
+    """
 
     def inspect(image: Any) -> None:
         focal = _exif(image).get_ifd(SUBSECTION).get(FOCAL_35)
@@ -123,7 +136,9 @@ def turned(image: Any) -> Any:
 
 
 def _exif(image: Any) -> Any:
-    """What precedes the pixels: for the rest of a PNG Pillow's own `getexif` would decode them all."""
+    """What precedes the pixels: for the rest of a PNG Pillow's own `getexif` would decode them
+    all.
+    """
     from PIL import Image
 
     return Image.Image.getexif(image)
@@ -132,8 +147,8 @@ def _exif(image: Any) -> Any:
 def _formats(path: Path) -> tuple[str, ...]:
     """Pillow's readers for a file: that of HEIC for such a file alone.
 
-    Choices: the camera's own rotation of a HEIC is applied by its reader, which also clears the EXIF orientation that
-      repeats it.
+    Choices: the camera's own rotation of a HEIC is applied by its reader, which also clears the
+      EXIF orientation that repeats it.
     """
     if not is_heic(path):
         return FORMATS
@@ -148,7 +163,8 @@ def _opened(path: Path, inspect: Callable[[Any], None], remedy: str) -> Any:
     from PIL import Image, UnidentifiedImageError
 
     regular(path, remedy)
-    warnings.simplefilter("error", Image.DecompressionBombWarning)  # Pillow's own limit lies above ours
+    # Pillow's own limit lies above ours
+    warnings.simplefilter("error", Image.DecompressionBombWarning)
     try:
         with Path(path).open("rb") as handle:
             image = Image.open(handle, formats=_formats(path))
@@ -157,11 +173,14 @@ def _opened(path: Path, inspect: Callable[[Any], None], remedy: str) -> Any:
             inspect(image)
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise InputError(
-            f"{path} is too large ({error}; {MAX_PIXELS // 10**6} megapixels and {MAX_SIDE} pixels a side are read); "
+            f"{path} is too large ({error}; {MAX_PIXELS // 10**6} megapixels and {MAX_SIDE} "
+            "pixels a side are read); "
             "reduce it"
         ) from None
     except UnidentifiedImageError:
-        raise InputError(f"{path} is no PNG, JPEG or HEIC image, whatever its name; convert it") from None
+        raise InputError(
+            f"{path} is no PNG, JPEG or HEIC image, whatever its name; convert it"
+        ) from None
     except DAMAGE as error:
         raise InputError(f"{path} is not a readable image ({error}); copy it again") from None
     return image

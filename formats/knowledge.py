@@ -1,4 +1,6 @@
-"""`knowledge/2`: an encoder of shape, and the map from its features to meaning that a set of lessons gives."""
+"""`knowledge/2`: an encoder of shape, and the map from its features to meaning that a set of
+lessons gives.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from chebsplat.formats.lesson import PlainSums, packed, unpacked
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
 SCHEMA = "chebsplat.knowledge/2"
-SHIPPED = Path(__file__).parents[1] / "teachers/knowledge"  # of the embedded teacher; ships with the package
+# of the embedded teacher; ships with the package
+SHIPPED = Path(__file__).parents[1] / "teachers/knowledge"
 SPECS: dict[str, Spec] = {"matrix": ("float32", "C", "d"), "embeddings": ("float16", "W", "d"),
                           "map": ("float32", "p", "2 d"), "basis": ("float32", "p", "r"),
                           "scale": ("float32", "p")}  # fmt: skip
@@ -27,10 +30,13 @@ class Knowledge:
 
     teacher:    its name; digest: of its files, as in `channels/2`.
     encoder:    constructor settings of the point encoder; weights: its arrays by name.
-    matrix:     f32 [C, d], from the teacher's C channels to the d that answers have; columns orthonormal.
+    matrix:     f32 [C, d], from the teacher's C channels to the d that answers have; columns
+      orthonormal.
     describe:   settings of the descriptors that it sees.
-    words:      W that it can name things by; embeddings f16 [W, d] of these, unit in the teacher's channels.
-    map:        f32 [p, 2 d], from features of shape to answers: d in the teacher's channels, d in those of words.
+    words:      W that it can name things by; embeddings f16 [W, d] of these, unit in the teacher's
+      channels.
+    map:        f32 [p, 2 d], from features of shape to answers: d in the teacher's channels, d in
+      those of words.
     basis:      f32 [p, r] of what was learned, in features times scale f32 [p] (Eq 15).
     card:       how it was taught; of each kind of room held out, the shares of points named right
                 (`stages.teach.measured`) and, in `novelty`, the largest ρ′.
@@ -59,7 +65,9 @@ DOCUMENT = ("teacher", "digest", "encoder", "describe", "words", "card", "lesson
 
 
 def write_knowledge(out: Path, knowledge: Knowledge) -> None:
-    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
+    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite
+    value.
+    """
     write_tensors(out / "weights.safetensors", knowledge.weights)
     write_tensors(out / "answers.safetensors", {name: getattr(knowledge, name) for name in SPECS})
     for number, sums in enumerate(knowledge.shipped):
@@ -71,7 +79,9 @@ def write_knowledge(out: Path, knowledge: Knowledge) -> None:
 
 def read_card(path: Path) -> dict[str, Any]:
     """All but the arrays. Raises InputError naming the damaged file and the remedy."""
-    card: dict[str, Any] = read_document(path, artifact.read_manifest(path, SCHEMA), "knowledge.json")
+    card: dict[str, Any] = read_document(
+        path, artifact.read_manifest(path, SCHEMA), "knowledge.json"
+    )
     return card
 
 

@@ -1,4 +1,6 @@
-"""`lesson/1`: what one scene teaches about shape: sums over its points, and how far they are to be trusted."""
+"""`lesson/1`: what one scene teaches about shape: sums over its points, and how far they are to be
+trusted.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,10 @@ SPECS: dict[str, Spec] = {"gram": ("float32", "half"), "cross": ("float32", "p",
 
 @dataclass
 class Lesson:
-    """sums: of the scene's points. notes: the scene's name, its teacher, points, words, ρ, σ_f, ρ′, and the evidence
-    for its trust: whether its labels were given, `familiar`, and the share of labels that shape and teacher have alike.
+    """sums: of the scene's points. notes: the scene's name, its teacher, points, words, ρ, σ_f, ρ′,
+    and the evidence
+    for its trust: whether its labels were given, `familiar`, and the share of labels that shape and
+      teacher have alike.
     """
 
     sums: PlainSums
@@ -31,7 +35,10 @@ class Lesson:
 def packed(sums: PlainSums) -> dict[str, np.ndarray]:
     """The lower half of A row by row, and b, f32."""
     gram, cross, _ = sums
-    return {"gram": gram[np.tril_indices(len(gram))].astype(np.float32), "cross": cross.astype(np.float32)}
+    return {
+        "gram": gram[np.tril_indices(len(gram))].astype(np.float32),
+        "cross": cross.astype(np.float32),
+    }
 
 
 def unpacked(arrays: dict[str, np.ndarray], square: float) -> PlainSums:
@@ -43,7 +50,9 @@ def unpacked(arrays: dict[str, np.ndarray], square: float) -> PlainSums:
 
 
 def write_lesson(out: Path, lesson: Lesson) -> None:
-    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite value."""
+    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite
+    value.
+    """
     write_tensors(out / "sums.safetensors", packed(lesson.sums))
     write_document(out / "lesson.json", {"square": lesson.sums[2]} | lesson.notes)
 
@@ -52,7 +61,10 @@ def read_lesson(path: Path) -> Lesson:
     """The lesson at `path`. Raises InputError naming the damaged file and the remedy."""
     manifest = artifact.read_manifest(path, SCHEMA)
     notes = read_document(path, manifest, "lesson.json")
-    return Lesson(unpacked(read_tensors(path, manifest, "sums.safetensors", SPECS), notes.pop("square")), notes)
+    return Lesson(
+        unpacked(read_tensors(path, manifest, "sums.safetensors", SPECS), notes.pop("square")),
+        notes,
+    )
 
 
 def read_notes(path: Path) -> dict[str, Any]:

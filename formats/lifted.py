@@ -1,4 +1,5 @@
-"""`lifted/2`: features that were lifted to the Gaussians of a checkpoint, and the evidence for them;
+"""`lifted/2`: features that were lifted to the Gaussians of a checkpoint, and the evidence for
+them;
 `refined/2`: the features after smoothing and knowledge, and how both were chosen.
 """
 
@@ -19,8 +20,10 @@ class Lifted(Record):
     features:   f32 [N, C]; zero where no training view sees a Gaussian.
     weights:    f32 [N], pixels: Σ α T over all training views.
     n_views:    i32 [N], training views that see it.
-    agreement:  f32 [N] in [0, 1]: length of the weighted mean of the views' directions; 1: all say the same.
-    halves:     f32 [2, N, C], features by each half of the training views; half_views i32 [2, N], how many see it.
+    agreement:  f32 [N] in [0, 1]: length of the weighted mean of the views' directions; 1: all say
+      the same.
+    halves:     f32 [2, N, C], features by each half of the training views; half_views i32 [2, N],
+      how many see it.
     notes:      names of the views, in order, and the number of observations.
     """
 
@@ -39,10 +42,12 @@ class Refined(Record):
     """N Gaussians in the order of their checkpoint, C channels of the teacher.
 
     features:   f32 [N, C].
-    confidence: f32 [N] in [0, 1]: how many votes there are and how far they agree; 0 where nothing is known.
-    notes:      what it started from, whether it was smoothed, views that knowledge counts for, what a view counts for
-                where the teacher is unsure of the scene, and by smoothing and strength the agreement of half the
-                training views with the other half.
+    confidence: f32 [N] in [0, 1]: how many votes there are and how far they agree; 0 where nothing
+      is known.
+    notes:      what it started from, whether it was smoothed, views that knowledge counts for, what
+      a view counts for
+                where the teacher is unsure of the scene, and by smoothing and strength the
+                agreement of half the training views with the other half.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.refined/2"

@@ -34,7 +34,8 @@ class Manifest:
     device: str = "cpu"
     threads: int = 1
     seconds: float = 0.0  # of all processes that worked on it
-    processes: list[dict[str, Any]] = field(default_factory=list)  # see `stages.runtime.machine.Stopwatch.processes`
+    # see `stages.runtime.machine.Stopwatch.processes`
+    processes: list[dict[str, Any]] = field(default_factory=list)
     files: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
@@ -49,12 +50,16 @@ def measured_on(manifest: Manifest) -> str:
 
 
 def is_key(value: object) -> bool:
-    """Whether a value names an artifact: 16 hexadecimal digits, and nothing that could lead out of a folder."""
+    """Whether a value names an artifact: 16 hexadecimal digits, and nothing that could lead out of
+    a folder.
+    """
     return isinstance(value, str) and KEY.fullmatch(value) is not None
 
 
 def is_member(name: str) -> bool:
-    """Whether a name stays below the folder that it is relative to, and is spelt in one way only."""
+    """Whether a name stays below the folder that it is relative to, and is spelt in one way
+    only.
+    """
     path = PurePosixPath(name)
     inside = bool(path.parts) and not path.is_absolute() and ".." not in path.parts
     return inside and str(path) == name and "\0" not in name
@@ -66,9 +71,11 @@ def remedy_of(path: Path) -> str:
 
 
 def parse_manifest(path: Path) -> Manifest:
-    """The manifest of the artifact `path`, whose members are not looked at. Raises InputError naming the file.
+    """The manifest of the artifact `path`, whose members are not looked at. Raises InputError
+    naming the file.
 
-    Choices: what nothing but our own code writes is believed; held to a rule is what becomes a path.
+    Choices: what nothing but our own code writes is believed; held to a rule is what becomes a
+      path.
     """
     file = path / MANIFEST
     document = parse_json(file, remedy_of(path))
@@ -78,7 +85,9 @@ def parse_manifest(path: Path) -> Manifest:
     except (TypeError, AttributeError, KeyError) as error:
         bad = [str(error)]
     if bad:
-        raise InputError(f"{file} is damaged: {bad[0]} is not what `publish` writes; {remedy_of(path)}")
+        raise InputError(
+            f"{file} is damaged: {bad[0]} is not what `publish` writes; {remedy_of(path)}"
+        )
     return manifest
 
 

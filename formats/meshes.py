@@ -26,7 +26,9 @@ GLTF_FLOAT, GLTF_UINT, GLTF_UBYTE, GLTF_VERTICES, GLTF_INDICES = 5126, 5125, 512
 
 
 class Mesh(NamedTuple):
-    """vertices f32 [V, 3] scene units; triangles i32 [T, 3]; colors u8 [V, 3]; labels i32 [V], -1: none, or None."""
+    """vertices f32 [V, 3] scene units; triangles i32 [T, 3]; colors u8 [V, 3]; labels i32 [V], -1:
+    none, or None.
+    """
 
     vertices: np.ndarray
     triangles: np.ndarray
@@ -35,8 +37,8 @@ class Mesh(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """depth f32 [H, W] scene units along the camera's axis, 0 where unknown; color u8 [H, W, 3]; K [3, 3]; pose [4, 4]
-    world to camera.
+    """depth f32 [H, W] scene units along the camera's axis, 0 where unknown; color u8 [H, W, 3]; K
+    [3, 3]; pose [4, 4] world to camera.
     """
 
     depth: np.ndarray
@@ -46,12 +48,13 @@ class Frame(NamedTuple):
 
 
 def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -> Mesh:
-    """The surface that depth images show, by a truncated signed distance on voxels of this edge, scene units.
+    """The surface that depth images show, by a truncated signed distance on voxels of this edge,
+    scene units.
 
     Args: open3d: the module; farthest: depth beyond it is not looked at.
-    Choices: truncated at four voxels; a voxel counts that more than LEAST_WEIGHT views saw. open3d takes the pixel that
-      a point falls into, so that the centre of the first one is at 0.5, as ours is. A frame that touches no block would
-      be an error to it, and is passed over.
+    Choices: truncated at four voxels; a voxel counts that more than LEAST_WEIGHT views saw. open3d
+      takes the pixel that a point falls into, so that the centre of the first one is at 0.5, as
+      ours is. A frame that touches no block would be an error to it, and is passed over.
     """
     core, image = open3d.core, open3d.t.geometry.Image
     names, widths = ("tsdf", "weight", "color"), ((1,), (1,), (3,))
@@ -65,7 +68,10 @@ def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -
             continue
         depth = image(core.Tensor(np.ascontiguousarray(frame.depth, np.float32)))
         color = image(core.Tensor(np.ascontiguousarray(frame.color, np.float32) / 255))
-        K, pose = (core.Tensor(np.ascontiguousarray(matrix, np.float64)) for matrix in (frame.K, frame.pose))
+        K, pose = (
+            core.Tensor(np.ascontiguousarray(matrix, np.float64))
+            for matrix in (frame.K, frame.pose)
+        )
         blocks = grid.compute_unique_block_coordinates(depth, K, pose, 1.0, farthest, TRUNCATED)
         grid.integrate(blocks, depth, color, K, pose, 1.0, farthest, TRUNCATED)
         n_seen += 1
@@ -74,37 +80,49 @@ def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -
         empty = np.zeros((0, 3))
         return Mesh(empty.astype(np.float32), empty.astype(np.int32), empty.astype(np.uint8))
     colors = (found.vertex.colors.numpy() * 255).round().clip(0, 255).astype(np.uint8)
-    return Mesh(found.vertex.positions.numpy(), found.triangle.indices.numpy().astype(np.int32), colors)
+    return Mesh(
+        found.vertex.positions.numpy(), found.triangle.indices.numpy().astype(np.int32), colors
+    )
 
 
 def meshlab() -> Any:
-    """The module that cleans meshes. Raises ConfigError where it, or a library that it is linked to, is missing."""
+    """The module that cleans meshes. Raises ConfigError where it, or a library that it is linked
+    to, is missing.
+    """
     try:
         import pymeshlab
     except ImportError as error:  # of the package, or of a library that it is linked to
         raise ConfigError(
-            f"cleaning a mesh needs pymeshlab ({error}); install the extra: pip install 'chebsplat[mesh]', and where a "
+            f"cleaning a mesh needs pymeshlab ({error}); install the extra: pip install "
+            "'chebsplat[mesh]', and where a "
             "library of the system is named, that one; or ask for the mesh as it is: --raw"
         ) from None
     return pymeshlab
 
 
-def cleaned(mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: int, voxel: float) -> Mesh:
-    """The mesh without what floats, its small holes closed, in at most so many triangles. Labels are dropped.
+def cleaned(
+    mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: int, voxel: float
+) -> Mesh:
+    """The mesh without what floats, its small holes closed, in at most so many triangles. Labels
+    are dropped.
 
-    Args: least_diagonal: of a connected part that stays, scene units; longest_hole: edges of a hole that is closed;
+    Args: least_diagonal: of a connected part that stays, scene units; longest_hole: edges of a hole
+      that is closed;
       voxel: edge of those that it was fused from, scene units.
     Raises: ConfigError as `meshlab`.
-    Choices: a vertex takes the colour of the nearest one before. Vertices are first clustered in cubic cells, of a size
-      that leaves what is wanted or EASY, and edges collapsed by quadrics from there on: the collapse alone takes four
-      times as long, for 0.002 of the F-score at 5 cm.
+    Choices: a vertex takes the colour of the nearest one before. Vertices are first clustered in
+      cubic cells, of a size that leaves what is wanted or EASY, and edges collapsed by quadrics
+      from there on: the collapse alone takes four times as long, for 0.002 of the F-score at 5 cm.
     """
     pymeshlab = meshlab()
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.add_mesh(pymeshlab.Mesh(mesh.vertices.astype(np.float64), mesh.triangles))
-    meshes.meshing_remove_connected_component_by_diameter(mincomponentdiag=pymeshlab.PureValue(least_diagonal))
+    meshes.meshing_remove_connected_component_by_diameter(
+        mincomponentdiag=pymeshlab.PureValue(least_diagonal)
+    )
     meshes.meshing_repair_non_manifold_edges()
-    meshes.meshing_close_holes(maxholesize=longest_hole, newfaceselected=False)  # a selection alone would be decimated
+    # a selection alone would be decimated
+    meshes.meshing_close_holes(maxholesize=longest_hole, newfaceselected=False)
     count, clustered = meshes.current_mesh().face_number(), max(n_triangles, EASY)
     if count > clustered:
         cell = voxel * (PER_CELL * count / clustered) ** 0.5
@@ -115,7 +133,10 @@ def cleaned(mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: i
         )
     meshes.meshing_remove_unreferenced_vertices()
     kept = meshes.current_mesh()
-    vertices, triangles = kept.vertex_matrix().astype(np.float32), kept.face_matrix().astype(np.int32)
+    vertices, triangles = (
+        kept.vertex_matrix().astype(np.float32),
+        kept.face_matrix().astype(np.int32),
+    )
     if not len(vertices):
         return Mesh(vertices.reshape(0, 3), triangles.reshape(0, 3), np.zeros((0, 3), np.uint8))
     return Mesh(vertices, triangles, mesh.colors[cKDTree(mesh.vertices).query(vertices)[1]])
@@ -125,8 +146,9 @@ def write_mesh(path: Path, mesh: Mesh, names: list[str] | None = None) -> None:
     """Write the mesh as .ply or .glb, by the file's name; labels with it, and what they are called.
 
     Raises: ConfigError on another suffix.
-    Choices: PLY has an int property `label`, -1 for none, and comments `label ID NAME`. GLB has `_LABEL` as a float
-      attribute, 255 values and more without loss, and the names in the mesh's extras; its axes are the scene's.
+    Choices: PLY has an int property `label`, -1 for none, and comments `label ID NAME`. GLB has
+      `_LABEL` as a float attribute, 255 values and more without loss, and the names in the mesh's
+      extras; its axes are the scene's.
     """
     writers = {".ply": _ply, ".glb": _glb}
     if path.suffix.lower() not in writers:
@@ -136,8 +158,12 @@ def write_mesh(path: Path, mesh: Mesh, names: list[str] | None = None) -> None:
 
 
 def _ply(path: Path, mesh: Mesh, names: list[str]) -> None:
-    kinds = [(axis, "f4") for axis in "xyz"] + [(channel, "u1") for channel in ("red", "green", "blue")]
-    vertices = np.zeros(len(mesh.vertices), kinds + ([("label", "i4")] if mesh.labels is not None else []))
+    kinds = [(axis, "f4") for axis in "xyz"] + [
+        (channel, "u1") for channel in ("red", "green", "blue")
+    ]
+    vertices = np.zeros(
+        len(mesh.vertices), kinds + ([("label", "i4")] if mesh.labels is not None else [])
+    )
     for column, axis in enumerate("xyz"):
         vertices[axis] = mesh.vertices[:, column]
     for column, channel in enumerate(("red", "green", "blue")):
@@ -146,7 +172,10 @@ def _ply(path: Path, mesh: Mesh, names: list[str]) -> None:
         vertices["label"] = mesh.labels
     faces = np.zeros(len(mesh.triangles), [("vertex_indices", "i4", (3,))])
     faces["vertex_indices"] = mesh.triangles
-    comments = [f"label {k} {name.encode('ascii', 'backslashreplace').decode()}" for k, name in enumerate(names)]
+    comments = [
+        f"label {k} {name.encode('ascii', 'backslashreplace').decode()}"
+        for k, name in enumerate(names)
+    ]
     elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
     PlyData(elements, byte_order="<", comments=comments).write(str(path))
 
@@ -163,7 +192,9 @@ def _glb(path: Path, mesh: Mesh, names: list[str]) -> None:
     views, accessors, offset = [], [], 0
     for k, (name, values, kind, shape) in enumerate(parts):
         target = GLTF_INDICES if name == "indices" else GLTF_VERTICES
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": values.nbytes, "target": target})
+        views.append(
+            {"buffer": 0, "byteOffset": offset, "byteLength": values.nbytes, "target": target}
+        )
         accessor = {"bufferView": k, "componentType": kind, "count": len(values), "type": shape}
         if name == "POSITION":
             accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}

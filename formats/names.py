@@ -15,18 +15,25 @@ LONGEST = 200  # characters of a label or of a view's name
 
 
 def unprintable(text: str, allowed: str = "") -> bool:
-    """Whether text holds control characters, line ends or halves of surrogate pairs other than those allowed."""
-    return any(unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in allowed for c in text)
+    """Whether text holds control characters, line ends or halves of surrogate pairs other than
+    those allowed.
+    """
+    return any(
+        unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in allowed for c in text
+    )
 
 
 def check_names(names: Any, what: str, where: object, remedy: str) -> None:
-    """Raise InputError unless `names` is a list of different names. A line end within one is allowed."""
+    """Raise InputError unless `names` is a list of different names. A line end within one is
+    allowed.
+    """
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{where}: {what} are no list of names; {remedy}")
     for name in names:
         if not name.strip() or len(name) > LONGEST or unprintable(name, "\n\t"):
             raise InputError(
-                f"{where}: {what}: {name[:40]!r} is no usable name: empty, longer than {LONGEST} characters, or with "
+                f"{where}: {what}: {name[:40]!r} is no usable name: empty, longer than {LONGEST} "
+                "characters, or with "
                 f"characters that cannot be printed; {remedy}"
             )
     for name, count in Counter(names).most_common(1):
@@ -35,12 +42,16 @@ def check_names(names: Any, what: str, where: object, remedy: str) -> None:
 
 
 def suggest(word: str, known: Iterable[str], n: int = 3) -> list[str]:
-    """At most `n` of the known names that look most like a word, the most alike first; none if none is like it."""
+    """At most `n` of the known names that look most like a word, the most alike first; none if none
+    is like it.
+    """
     return difflib.get_close_matches(word[:LONGEST], list(known), n)
 
 
 def natural(name: str) -> tuple[Any, ...]:
-    """Sort key under which frame_2 precedes frame_10; equal numbers are told apart by their spelling."""
+    """Sort key under which frame_2 precedes frame_10; equal numbers are told apart by their
+    spelling.
+    """
     parts = re.split(r"(\d+)", name)
     return tuple(int(part) if k % 2 else part for k, part in enumerate(parts)), name
 

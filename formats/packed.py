@@ -1,7 +1,9 @@
-"""Gaussians in 20 bytes each, for pages that a browser opens: quantised, in planes of bytes that compress well.
+"""Gaussians in 20 bytes each, for pages that a browser opens: quantised, in planes of bytes that
+compress well.
 
-`stages/pages/scene/splats.js` reads what this module writes. Planes are u8 [..., N], one Gaussian a column; numbers of
-more than one byte lie lowest byte first. A value is its integer times `step` plus `low`.
+`stages/pages/scene/splats.js` reads what this module writes. Planes are u8 [..., N], one Gaussian a
+column; numbers of more than one byte lie lowest byte first. A value is its integer times `step`
+plus `low`.
 """
 
 from __future__ import annotations
@@ -13,19 +15,23 @@ import numpy as np
 
 BYTES = {"means": 9, "log_scales": 3, "quats": 4, "opacities": 1, "colors": 3}  # of a Gaussian
 C0 = 0.28209479177387814  # of SH band 0, from coefficients to colours
-# ln of what a scale may be beside the longest axes: of 5 % of the Gaussians, thinner than a pixel, and of 95 %, flat
+# ln of what a scale may be beside the longest axes: of 5 % of the Gaussians, thinner than a pixel,
+# and of 95 %, flat
 LEAST, MOST = -4.0, 12.0
-# From the middle, in extents of 90 % of the centres: what lies farther is drawn there, as small as it looks
+# From the middle, in extents of 90 % of the centres: what lies farther is drawn there, as small as
+# it looks
 FARTHEST = 1000.0
 COLORS = (-1.0, 3.0)  # of SH degree 0 in training's [0, 1]; beyond it no pixel can tell
 
 
 @dataclass
 class Packed:
-    """Arrays by name, and for each quantised one its `low` and `step`, lists of a number for each axis or channel.
+    """Arrays by name, and for each quantised one its `low` and `step`, lists of a number for each
+    axis or channel.
 
     means:      u8 [3, 3, N], axis and byte; `low` and `step` in the scene's frame and units.
-    log_scales: u8 [3, N]; quats: u8 [4, N], of u32: the largest entry's place in the 2 upper bits, the others in order
+    log_scales: u8 [3, N]; quats: u8 [4, N], of u32: the largest entry's place in the 2 upper bits,
+      the others in order
                 (wxyz, the largest positive) as 10 bits each over ±1/√2.
     opacities:  u8 [N] of [0, 1]; colors: u8 [3, N], of SH degree 0, 1 is white.
     sh1:        i8 [9, N], coefficients of band 1, coefficient-major; only where asked for.
@@ -37,11 +43,13 @@ class Packed:
 
 
 def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
-    """Quantise raw parameters (`formats.scene.Scene.parameters`). Raises ValueError on a degree that is not 0 or 1.
+    """Quantise raw parameters (`formats.scene.Scene.parameters`). Raises ValueError on a degree
+    that is not 0 or 1.
 
-    Choices: 24 bits a coordinate, and FARTHEST, so that a stray Gaussian far off costs the others nothing that shows;
-      scales to 2 % or so, and 4 % at worst: what all others have for sizes bounds those of a few; activated opacities,
-      since logits would spend their bits where nothing changes.
+    Choices: 24 bits a coordinate, and FARTHEST, so that a stray Gaussian far off costs the others
+      nothing that shows; scales to 2 % or so, and 4 % at worst: what all others have for sizes
+      bounds those of a few; activated opacities, since logits would spend their bits where nothing
+      changes.
     """
     if sh_degree not in (0, 1):
         raise ValueError(f"a page holds SH degree 0 or 1, not {sh_degree}")
@@ -55,9 +63,13 @@ def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
         integers: np.ndarray = np.round((values - low) / step).T
         return integers
 
-    low, middle, high = np.quantile(parameters["means"].astype(np.float64), (0.05, 0.5, 0.95), axis=0)
+    low, middle, high = np.quantile(
+        parameters["means"].astype(np.float64), (0.05, 0.5, 0.95), axis=0
+    )
     away = parameters["means"] - middle
-    drawn = np.minimum(FARTHEST * ((high - low).max() or np.inf) / np.linalg.norm(away, axis=1).clip(1e-300), 1)
+    drawn = np.minimum(
+        FARTHEST * ((high - low).max() or np.inf) / np.linalg.norm(away, axis=1).clip(1e-300), 1
+    )
     means = levels("means", middle + drawn[:, None] * away, (1 << 24) - 1).astype(np.uint32)
     arrays["means"] = np.stack([means >> shift & 255 for shift in (0, 8, 16)], 1).astype(np.uint8)
     log_scales = parameters["log_scales"] + np.log(drawn)[:, None]
@@ -77,7 +89,9 @@ def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
 
 
 def unpack(packed: Packed) -> dict[str, np.ndarray]:
-    """Parameters as given to `pack`, float32, quaternions unit; opacities of 0 and 1 as logits of ±20."""
+    """Parameters as given to `pack`, float32, quaternions unit; opacities of 0 and 1 as logits of
+    ±20.
+    """
     arrays = packed.arrays
 
     def values(name: str, integers: np.ndarray) -> np.ndarray:
@@ -121,7 +135,9 @@ def smallest_three(quats: np.ndarray) -> np.ndarray:
     unit *= np.where(unit[rows, place] < 0, -1, 1)[:, None]
     others = unit[rows[:, None], OTHERS[place]]
     steps = np.round((others * np.sqrt(0.5) + 0.5) * 1023).clip(0, 1023).astype(np.uint32)
-    words: np.ndarray = place.astype(np.uint32) << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]
+    words: np.ndarray = (
+        place.astype(np.uint32) << 30 | steps[:, 0] << 20 | steps[:, 1] << 10 | steps[:, 2]
+    )
     return words
 
 
@@ -129,7 +145,9 @@ def from_smallest_three(planes: np.ndarray) -> np.ndarray:
     """Bytes u32 [4, N] to unit quaternions [N, 4]."""
     words = planes[0] | planes[1] << 8 | planes[2] << 16 | planes[3] << 24
     place = words >> 30
-    others = (np.stack([words >> 20 & 1023, words >> 10 & 1023, words & 1023], 1) / 1023 - 0.5) / np.sqrt(0.5)
+    others = (
+        np.stack([words >> 20 & 1023, words >> 10 & 1023, words & 1023], 1) / 1023 - 0.5
+    ) / np.sqrt(0.5)
     quats = np.empty((len(words), 4))
     rows = np.arange(len(words))
     quats[rows[:, None], OTHERS[place]] = others
@@ -142,7 +160,9 @@ OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # places beside
 
 
 def to_bytes(arrays: dict[str, np.ndarray]) -> tuple[bytes, dict[str, Any]]:
-    """Arrays one after the other, each from a multiple of 4 on, and where each lies: dtype, shape, offset."""
+    """Arrays one after the other, each from a multiple of 4 on, and where each lies: dtype, shape,
+    offset.
+    """
     blob, places = bytearray(), {}
     for name, array in arrays.items():
         blob += bytes(-len(blob) % 4)
@@ -154,6 +174,8 @@ def to_bytes(arrays: dict[str, np.ndarray]) -> tuple[bytes, dict[str, Any]]:
 def from_bytes(blob: bytes, places: dict[str, Any]) -> dict[str, np.ndarray]:
     """What `to_bytes` was given."""
     return {
-        name: np.frombuffer(blob, at["dtype"], int(np.prod(at["shape"])), at["offset"]).reshape(at["shape"])
+        name: np.frombuffer(blob, at["dtype"], int(np.prod(at["shape"])), at["offset"]).reshape(
+            at["shape"]
+        )
         for name, at in places.items()
     }

@@ -1,4 +1,6 @@
-"""`model/1`: cameras, poses and points of photos that came without, as structure from motion found them."""
+"""`model/1`: cameras, poses and points of photos that came without, as structure from motion found
+them.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +15,12 @@ from chebsplat.formats.record import Array, Record
 @dataclass
 class PhotoModel(Record):
     """names:   of the registered photos, or of a video's frames, whose numbers are `frames`.
-    cameras:    COLMAP's [model, parameters, width, height], in pixels of the upright photos; camera: each photo's.
+    cameras:    COLMAP's [model, parameters, width, height], in pixels of the upright photos;
+      camera: each photo's.
     cam_from_world: f64 [V, 4, 4]; points: f64 [N, 3], colors u8 [N, 3], errors f64 [N] pixels.
     tracks:     i32 [T, 2] (point, photo).
-    notes:      sentences for the reader. judged: what the model's trust is read off (`stages/reconstruction/judge.py`).
+    notes:      sentences for the reader. judged: what the model's trust is read off
+      (`stages/reconstruction/judge.py`).
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.model/1"

@@ -1,6 +1,7 @@
 """3DGS PLY files: the 62-float layout that viewers load, trimmed to the SH bands in use.
 
-`read_vertices` is the one door to reading PLY: what a header declares is held against the file's size.
+`read_vertices` is the one door to reading PLY: what a header declares is held against the file's
+  size.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ _FIXED = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 _TAIL = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 HEADER = 1 << 20  # bytes that a header may take
 THIN = 1e-3  # of the smaller scale of a disc (2DGS): how thick it is taken
-MOST_UNUSABLE = 0.5  # of the Gaussians of a file: beyond it the file is damaged, and not only some of them
+# of the Gaussians of a file: beyond it the file is damaged, and not only some of them
+MOST_UNUSABLE = 0.5
 _PART = re.compile(rb"^[ \t]*(?:element[ \t]+\S+[ \t]+(\d{1,30})|(property))\b", re.MULTILINE)
 
 
@@ -37,20 +39,27 @@ def write_ply(
     label_names: list[str] | None = None,
     world: World = HERE,
 ) -> None:
-    """Write raw parameters (`formats.gaussians.Gaussians.parameters`) as a binary little-endian 3DGS PLY.
+    """Write raw parameters (`formats.gaussians.Gaussians.parameters`) as a binary little-endian
+    3DGS PLY.
 
     Args:
       parameters: where `degrees` [N] are given, `sh_degree` follows `rot_3`.
       degree:     highest band to write; `f_rest` is channel-major and shorter below 3.
       labels:     [N] class ids, -1 none; `label` is then the last property.
-      label_names: by id, written as comments `label ID NAME` of those that occur, in ASCII: what else a name holds is
-                   escaped as Python does (`caf\\xe9`); `labels.json` beside a scene's PLY has the names themselves.
+      label_names: by id, written as comments `label ID NAME` of those that occur, in ASCII: what
+        else a name holds is
+                   escaped as Python does (`caf\\xe9`); `labels.json` beside a scene's PLY has the
+                   names themselves.
       world:      of the parameters; the file has its source's.
-    Choices: normals are written as zeros, since some loaders hard-code their presence. Tags are floats like all else:
-      Open3D skips a `ushort`, and gsply 0.4 and spz-js 1.2 take any other type, or a second element, for the data.
-      Only x, y, z are doubles, and only of a scene far from its source's origin, which floats would round to steps.
+    Choices: normals are written as zeros, since some loaders hard-code their presence. Tags are
+      floats like all else: Open3D skips a `ushort`, and gsply 0.4 and spz-js 1.2 take any other
+        type, or a second element, for the data.
+      Only x, y, z are doubles, and only of a scene far from its source's origin, which floats would
+      round to steps.
     """
-    parameters = parameters | {"log_scales": parameters["log_scales"] + np.float32(np.log(world.scale))}
+    parameters = parameters | {
+        "log_scales": parameters["log_scales"] + np.float32(np.log(world.scale))
+    }
     n, n_rest = len(parameters["means"]), REST[degree]
     names = [*_FIXED, *(f"f_rest_{i}" for i in range(3 * n_rest)), *_TAIL]
     means = world.outward(parameters["means"])
@@ -83,34 +92,50 @@ def write_ply(
     PlyData([vertex], byte_order="<", comments=comments).write(str(path))
 
 
-def read_ply(path: Path, world: World = HERE) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
-    """Raw parameters, file degree, and labels where the file has them. Normals and tags are optional.
+def read_ply(
+    path: Path, world: World = HERE
+) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
+    """Raw parameters, file degree, and labels where the file has them. Normals and tags are
+    optional.
 
     Args:   world: to bring the Gaussians into, from that of its source.
-    Raises: InputError naming the file: not a PLY, truncated, not a 3DGS layout, or most values not finite.
-    Choices: discs of two scales (2DGS) are THIN across them. The filter that mip-splatting, GOF and RaDe-GS keep beside
-      the scales is fused into scales and opacities, as these export it. `usable` says what is left out.
+    Raises: InputError naming the file: not a PLY, truncated, not a 3DGS layout, or most values not
+      finite.
+    Choices: discs of two scales (2DGS) are THIN across them. The filter that mip-splatting, GOF and
+      RaDe-GS keep beside the scales is fused into scales and opacities, as these export it.
+      `usable` says what is left out.
     """
     path = Path(path)
     vertex = read_vertices(path, "export the scene again")
     names = [p.name for p in vertex.properties]
     flat = "scale_2" not in names
-    absent = [name for name in (*_FIXED[:3], *_FIXED[6:], *_TAIL) if name not in names and name != "scale_2"]
+    absent = [
+        name
+        for name in (*_FIXED[:3], *_FIXED[6:], *_TAIL)
+        if name not in names and name != "scale_2"
+    ]
     if absent:
-        raise InputError(f"{path} has no property {absent[0]}: not an uncompressed 3DGS PLY; convert it first")
+        raise InputError(
+            f"{path} has no property {absent[0]}: not an uncompressed 3DGS PLY; convert it first"
+        )
     n_rest = sum(name.startswith("f_rest_") for name in names)
     degree = next((d for d, k in REST.items() if 3 * k == n_rest), None)
     if degree is None:
         raise InputError(f"{path} has {n_rest} f_rest properties; 0, 9, 24 or 45 are possible")
 
-    def block(wanted: list[str], inward: Callable[[np.ndarray], np.ndarray] = np.asarray) -> np.ndarray:
+    def block(
+        wanted: list[str], inward: Callable[[np.ndarray], np.ndarray] = np.asarray
+    ) -> np.ndarray:
         with np.errstate(over="ignore"):  # of doubles; what is infinite then is refused below
             return inward(np.stack([vertex[name] for name in wanted], 1)).astype(np.float32)
 
     def whole(name: str, low: int, high: int) -> np.ndarray:
         values: np.ndarray = np.asarray(vertex[name])[kept]
         if not ((values >= low) & (values <= high) & (values == np.round(values))).all():
-            raise InputError(f"{path}: {name} holds more than whole numbers {low} to {high}; export the scene again")
+            raise InputError(
+                f"{path}: {name} holds more than whole numbers {low} to {high}; "
+                "export the scene again"
+            )
         return values
 
     n = len(vertex.data)
@@ -126,12 +151,16 @@ def read_ply(path: Path, world: World = HERE) -> tuple[dict[str, np.ndarray], in
         "shN": shN,
     }
     if flat:
-        log.info("%s holds discs of two scales, which are taken %g times as thick as wide", path, THIN)
+        log.info(
+            "%s holds discs of two scales, which are taken %g times as thick as wide", path, THIN
+        )
         thin = parameters["log_scales"].min(1, keepdims=True) + np.float32(np.log(THIN))
         parameters["log_scales"] = np.concatenate([parameters["log_scales"], thin], 1)
     if "filter_3D" in names:
         log.info("%s: its filter_3D is fused into scales and opacities", path)
-        parameters |= fused(parameters["log_scales"], parameters["logit_opacities"], np.asarray(vertex["filter_3D"]))
+        parameters |= fused(
+            parameters["log_scales"], parameters["logit_opacities"], np.asarray(vertex["filter_3D"])
+        )
     parameters, kept = usable(path, parameters)
     parameters["log_scales"] -= np.float32(np.log(world.scale))
     if "sh_degree" in names:
@@ -141,44 +170,67 @@ def read_ply(path: Path, world: World = HERE) -> tuple[dict[str, np.ndarray], in
 
 
 def fused(log_scales: np.ndarray, logits: np.ndarray, size: np.ndarray) -> dict[str, np.ndarray]:
-    """Gaussians widened by an isotropic one of standard deviation `size` [N] (scene units), their integral kept.
+    """Gaussians widened by an isotropic one of standard deviation `size` [N] (scene units), their
+    integral kept.
 
-    Choices: scale² + size² for each scale², and opacities times the root of the ratio of the determinants, as
-      mip-splatting fuses its 3D filter. log_scales [N, 3], logits [N]; float64 within.
+    Choices: scale² + size² for each scale², and opacities times the root of the ratio of the
+      determinants, as mip-splatting fuses its 3D filter. log_scales [N, 3], logits [N]; float64
+      within.
     """
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        wide = 0.5 * np.logaddexp(2 * log_scales.astype(float), 2 * np.log(np.abs(size.astype(float)))[:, None])
+        wide = 0.5 * np.logaddexp(
+            2 * log_scales.astype(float), 2 * np.log(np.abs(size.astype(float)))[:, None]
+        )
         log_opacity = -np.logaddexp(0, -logits.astype(float)) + (log_scales - wide).sum(1)
         opacity = log_opacity - np.log(-np.expm1(log_opacity))
     return {"log_scales": wide.astype(np.float32), "logit_opacities": opacity.astype(np.float32)}
 
 
-def usable(path: Path, parameters: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The parameters of the Gaussians that are finite, and which these are, bool [N]; a line says how many are not.
+def usable(
+    path: Path, parameters: dict[str, np.ndarray]
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The parameters of the Gaussians that are finite, and which these are, bool [N]; a line says
+    how many are not.
 
     Raises:  InputError where more than MOST_UNUSABLE are not.
-    Choices: an infinite logit, which converters write for 8-bit opacities of exactly 0 or 1, becomes ±20: the same
-      opacity in float32. A scale of 0, -inf as its logarithm, is left out: nothing can be computed of it.
+    Choices: an infinite logit, which converters write for 8-bit opacities of exactly 0 or 1,
+      becomes ±20: the same opacity in float32. A scale of 0, -inf as its logarithm, is left out:
+      nothing can be computed of it.
     """
     logits = parameters["logit_opacities"]
     infinite = np.isinf(logits)
-    parameters = parameters | {"logit_opacities": np.where(infinite, np.copysign(np.float32(20), logits), logits)}
-    finite = {name: np.isfinite(values).reshape(len(values), -1).all(1) for name, values in parameters.items()}
+    parameters = parameters | {
+        "logit_opacities": np.where(infinite, np.copysign(np.float32(20), logits), logits)
+    }
+    finite = {
+        name: np.isfinite(values).reshape(len(values), -1).all(1)
+        for name, values in parameters.items()
+    }
     kept = np.logical_and.reduce(list(finite.values()))
     if kept.all():
         return parameters, kept
     worst = min(finite, key=lambda name: finite[name].sum())
     if kept.mean() < MOST_UNUSABLE:
-        raise InputError(f"{path}: {worst} holds non-finite values in {(~kept).sum()} rows; export the scene again")
-    log.warning("%s: %d of %d Gaussians are not finite (%s) and left out", path, (~kept).sum(), len(kept), worst)
+        raise InputError(
+            f"{path}: {worst} holds non-finite values in {(~kept).sum()} rows; "
+            "export the scene again"
+        )
+    log.warning(
+        "%s: %d of %d Gaussians are not finite (%s) and left out",
+        path,
+        (~kept).sum(),
+        len(kept),
+        worst,
+    )
     return {name: values[kept] for name, values in parameters.items()}, kept
 
 
 def read_vertices(path: Path, remedy: str) -> Any:
-    """plyfile's element `vertex`, of scalar properties. Raises InputError naming the file and the remedy.
+    """plyfile's element `vertex`, of scalar properties. Raises InputError naming the file and the
+    remedy.
 
-    Choices: a value takes a byte at least, in text and in binary; a header that declares more values than the file has
-      bytes lies, and is refused before anything is allocated.
+    Choices: a value takes a byte at least, in text and in binary; a header that declares more
+      values than the file has bytes lies, and is refused before anything is allocated.
     """
     size = regular(path, remedy).st_size
     try:
@@ -189,12 +241,22 @@ def read_vertices(path: Path, remedy: str) -> Any:
         if (declared := _values(header)) > size:
             raise ValueError(f"it declares {declared:,} values and has {size:,} bytes")
         vertex = PlyData.read(str(path))["vertex"]
-    except (PlyParseError, OSError, LookupError, TypeError, ValueError, MemoryError, OverflowError) as error:
+    except (
+        PlyParseError,
+        OSError,
+        LookupError,
+        TypeError,
+        ValueError,
+        MemoryError,
+        OverflowError,
+    ) as error:
         line = " ".join(str(error).split())[:200]
         raise InputError(f"{path} is not a readable PLY ({line}); {remedy}") from None
     lists = [part.name for part in vertex.properties if isinstance(part, PlyListProperty)]
     if lists:
-        raise InputError(f"{path}: {lists[0][:60]} holds lists, one number a vertex is needed; {remedy}")
+        raise InputError(
+            f"{path}: {lists[0][:60]} holds lists, one number a vertex is needed; {remedy}"
+        )
     return vertex
 
 

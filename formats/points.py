@@ -1,5 +1,5 @@
-"""`points/2`: registered cameras, and points with normals and local anisotropic covariances, and swept depth;
-point clouds in PLY files.
+"""`points/2`: registered cameras, and points with normals and local anisotropic covariances, and
+swept depth; point clouds in PLY files.
 """
 
 from __future__ import annotations
@@ -24,11 +24,14 @@ class Points(Record):
 
     names:          of the registered views; the others could not be posed.
     Ks:             f64 [V, 3, 3] pixels; cam_from_world: f64 [V, 4, 4].
-    means:          f64 [N, 3] scene units; colors: u8 [N, 3]; normals: f32 [N, 3] unit, facing a camera.
-    covariances:    f32 [N, 3, 3] of the neighbourhood, scaled to the local spacing (docs/method.md, section 1).
+    means:          f64 [N, 3] scene units; colors: u8 [N, 3]; normals: f32 [N, 3] unit, facing a
+      camera.
+    covariances:    f32 [N, 3, 3] of the neighbourhood, scaled to the local spacing (docs/method.md,
+      section 1).
     tracks:         i32 [T, 2] (point, view) observations; empty where points come from depth.
     notes:          how the points came about, reprojection errors, counts.
-    depths:         f32 [V, h, w] z that a sweep of the photos, reduced to this size, found; 0: none; None: no sweep.
+    depths:         f32 [V, h, w] z that a sweep of the photos, reduced to this size, found; 0:
+      none; None: no sweep.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.points/2"
@@ -41,33 +44,43 @@ class Points(Record):
     covariances: Annotated[np.ndarray, Array("float32", ("point", 3, 3), "scene units squared")]
     tracks: Annotated[np.ndarray, Array("int32", ("observation", 2), "index of a point, of a view")]
     notes: dict[str, Any] = field(default_factory=dict)
-    depths: Annotated[np.ndarray | None, Array("float32", ("view", "row", "column"), "scene units, z; 0 unknown")] = (
-        None
-    )
+    depths: Annotated[
+        np.ndarray | None, Array("float32", ("view", "row", "column"), "scene units, z; 0 unknown")
+    ] = None
 
 
 def thinned(points: Points, most: int, seed: int) -> Points:
-    """At most so many of the points, drawn alike from all and in their order; without the tracks of any."""
+    """At most so many of the points, drawn alike from all and in their order; without the tracks of
+    any.
+    """
     if len(points.means) <= most:
         return points
     kept = np.sort(np.random.default_rng(seed).choice(len(points.means), most, replace=False))
-    fewer = {name: getattr(points, name)[kept] for name in ("means", "colors", "normals", "covariances")}
+    fewer = {
+        name: getattr(points, name)[kept] for name in ("means", "colors", "normals", "covariances")
+    }
     return replace(points, **fewer, tracks=points.tracks[:0])
 
 
 def read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Positions f32 [N, 3] and colours u8 [N, 3], None without any. Raises InputError naming file and remedy."""
+    """Positions f32 [N, 3] and colours u8 [N, 3], None without any. Raises InputError naming file
+    and remedy.
+    """
     vertex = read_vertices(path, "restore it: no other points take its place")
     known = {part.name for part in vertex.properties}
     if not known.issuperset("xyz"):
         raise InputError(f"{path} has no x, y, z; restore it: no other points take its place")
     if not 0 < len(vertex.data) <= MOST:
-        raise InputError(f"{path} holds {len(vertex.data)} points; 1 to {MOST} are possible: restore it, or thin it")
+        raise InputError(
+            f"{path} holds {len(vertex.data)} points; 1 to {MOST} are possible: "
+            "restore it, or thin it"
+        )
     with np.errstate(over="ignore"):  # of doubles
         points = np.stack([np.asarray(vertex[axis], np.float32) for axis in "xyz"], 1)
     if bad := int((~(np.abs(points) <= FARTHEST).all(1)).sum()):
         raise InputError(
-            f"{path} holds {bad} points that are not finite, or farther than {FARTHEST:.0e} units from the origin; "
+            f"{path} holds {bad} points that are not finite, or farther than {FARTHEST:.0e} units "
+            "from the origin; "
             "restore it, or move the scene's origin into the scene"
         )
     channels = ("red", "green", "blue")

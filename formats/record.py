@@ -1,8 +1,9 @@
-"""Artifacts of numbers: a dataclass whose arrays are the arrays of one zarr v3 group, and whose other fields are the
-group's attributes.
+"""Artifacts of numbers: a dataclass whose arrays are the arrays of one zarr v3 group, and whose
+other fields are the group's attributes.
 
-`zarr.open_group(path)["means"][:]` reads any of them. What a reader relies on is checked in three places: the manifest
-has every file with its size, `zarr.json` files are compared with their digest, and each chunk carries its crc32c.
+`zarr.open_group(path)["means"][:]` reads any of them. What a reader relies on is checked in three
+places: the manifest has every file with its size, `zarr.json` files are compared with their digest,
+  and each chunk carries its crc32c.
 """
 
 from __future__ import annotations
@@ -38,8 +39,10 @@ class Array:
     """Storage of a field of a `Record`.
 
     Args:
-      axes:     a name an axis, or its length where that is fixed; an axis has one length throughout a record.
-      by_view:  a chunk holds one entry of the first axis, and the array stays on disk until it is indexed.
+      axes:     a name an axis, or its length where that is fixed; an axis has one length throughout
+        a record.
+      by_view:  a chunk holds one entry of the first axis, and the array stays on disk until it is
+        indexed.
       any_value: nan and infinities may be stored.
     """
 
@@ -53,15 +56,16 @@ class Array:
 class Record:
     """Base of a dataclass that is stored as one zarr group.
 
-    A field annotated with an `Array` is an array of the group, absent where it is None; a field that is a `Record` is
-    a group within; any other field is an attribute and must be JSON-able.
+    A field annotated with an `Array` is an array of the group, absent where it is None; a field
+    that is a `Record` is a group within; any other field is an attribute and must be JSON-able.
     """
 
     SCHEMA: ClassVar[str] = ""
     COMPRESSED: ClassVar[bool] = True
 
     def write(self, out: Path) -> None:
-        """Fill the directory that `artifact.publish` yields. An array that lies in `out` already stays.
+        """Fill the directory that `artifact.publish` yields. An array that lies in `out` already
+        stays.
 
         Raises: ValueError naming an array of another dtype or shape, or a value that is not finite.
         """
@@ -102,12 +106,16 @@ class Record:
                 del attributes[name]
             record: Self = _built(cls, path, manifest, attributes)
             stored = dict(_arrays_of(record))
-            check_lengths({name: (spec.axes, value.shape) for name, (spec, value) in stored.items()})
+            check_lengths(
+                {name: (spec.axes, value.shape) for name, (spec, value) in stored.items()}
+            )
         return record
 
 
 def read_attributes(path: Path, manifest: Manifest) -> dict[str, Any]:
-    """Attributes of an artifact's group, without opening an array. Raises InputError naming the damaged file."""
+    """Attributes of an artifact's group, without opening an array. Raises InputError naming the
+    damaged file.
+    """
     document = parse_json(artifact.checked(path, manifest, METADATA), remedy_of(path))
     attributes: dict[str, Any] = document["attributes"]
     return attributes
@@ -124,13 +132,15 @@ def reading(path: Path) -> Iterator[None]:
 
 
 class StoredArray:
-    """An array of a published artifact, read as it is indexed: `array[i]` and `array[:]` give numpy arrays."""
+    """An array of a published artifact, read as it is indexed: `array[i]` and `array[:]` give numpy
+    arrays.
+    """
 
     def __init__(self, root: Path, manifest: Manifest, name: str):
         """Open the array `name` of the artifact at `root`; no value is read yet.
 
-        Raises: InputError if its metadata are damaged, or the manifest does not list all of its chunks: zarr would
-          read those as fill values.
+        Raises: InputError if its metadata are damaged, or the manifest does not list all of its
+          chunks: zarr would read those as fill values.
         """
         self.root, self.name, self.manifest = root, name, manifest
         artifact.checked(root, manifest, f"{name}/{METADATA}")
@@ -161,7 +171,10 @@ Stack = np.ndarray | StoredArray
 
 
 def create_array(
-    store: Path | zarr.storage.MemoryStore, shape: tuple[int, ...], spec: Array, compressed: bool = True
+    store: Path | zarr.storage.MemoryStore,
+    shape: tuple[int, ...],
+    spec: Array,
+    compressed: bool = True,
 ) -> zarr.Array[Any]:
     """An array to be filled chunk by chunk. store: its folder, in that of its group, or memory."""
     rows = 1 if spec.by_view else ROWS
@@ -182,7 +195,8 @@ def create_array(
 def write_array(path: Path, values: np.ndarray, spec: Array, compressed: bool = True) -> None:
     """Write an array whole.
 
-    Choices: chunks are compressed side by side in memory, so many at a time as BATCH bytes hold, and written one by
+    Choices: chunks are compressed side by side in memory, so many at a time as BATCH bytes hold,
+      and written one by
       one: twice as fast as zarr's own files, and where a disk is full no other write is under way.
     """
     files: dict[str, Any] = {}
@@ -205,12 +219,15 @@ def _put(files: dict[str, Any], folder: Path) -> None:
 
 def chunk_names(array: zarr.Array[Any]) -> Iterator[str]:
     """Files that hold an array's values, below its folder."""
-    counts = (range(math.ceil(n / chunk)) for n, chunk in zip(array.shape, array.chunks, strict=True))
+    counts = (
+        range(math.ceil(n / chunk)) for n, chunk in zip(array.shape, array.chunks, strict=True)
+    )
     return (".".join(["c", *map(str, place)]) for place in itertools.product(*counts))
 
 
 def check_lengths(arrays: dict[str, tuple[tuple[str | int, ...], tuple[int, ...]]]) -> None:
-    """Hold shapes against axes. Raises ValueError naming the first array that differs, or None of them.
+    """Hold shapes against axes. Raises ValueError naming the first array that differs, or None of
+    them.
 
     Args: arrays: by name its axes and its shape.
     """
@@ -219,14 +236,18 @@ def check_lengths(arrays: dict[str, tuple[tuple[str | int, ...], tuple[int, ...]
         for axis, n in zip(axes, shape, strict=False):
             if isinstance(axis, str):
                 lengths.setdefault(axis, n)
-        expected = tuple(lengths.get(axis, axis) if isinstance(axis, str) else axis for axis in axes)
+        expected = tuple(
+            lengths.get(axis, axis) if isinstance(axis, str) else axis for axis in axes
+        )
         if shape != expected:
             raise ValueError(f"{name} has shape {shape}, expected {expected}")
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Fields of a record: arrays by name, those that may be absent, records within, and names of attributes."""
+    """Fields of a record: arrays by name, those that may be absent, records within, and names of
+    attributes.
+    """
 
     arrays: dict[str, Array]
     optional: set[str]
@@ -242,7 +263,9 @@ def layout_of(cls: type[Record]) -> Layout:
     for name in (field.name for field in fields(cls)):  # type: ignore[arg-type]  # all are dataclasses
         parts = (hints[name], *get_args(hints[name]))
         spec = next((part for part in parts if isinstance(part, Array)), None)
-        within = next((part for part in parts if isinstance(part, type) and issubclass(part, Record)), None)
+        within = next(
+            (part for part in parts if isinstance(part, type) and issubclass(part, Record)), None
+        )
         if spec is not None:
             layout.arrays[name] = spec
             if NoneType in get_args(parts[1]):
@@ -255,7 +278,9 @@ def layout_of(cls: type[Record]) -> Layout:
 
 
 def _arrays_of(record: Record, prefix: str = "") -> Iterator[tuple[str, tuple[Array, Any]]]:
-    """Name, specification and value of each array that a record holds, those of records within too."""
+    """Name, specification and value of each array that a record holds, those of records within
+    too.
+    """
     layout = layout_of(type(record))  # type: ignore[arg-type]  # mypy takes no class for hashable
     for name, spec in layout.arrays.items():
         if (value := getattr(record, name)) is not None:
@@ -269,10 +294,14 @@ def _attributes_of(record: Record) -> dict[str, Any]:
     layout = layout_of(type(record))  # type: ignore[arg-type]  # mypy takes no class for hashable
     attributes = {name: getattr(record, name) for name in layout.attributes}
     within = {name: getattr(record, name) for name in layout.records}
-    return attributes | {name: None if value is None else _attributes_of(value) for name, value in within.items()}
+    return attributes | {
+        name: None if value is None else _attributes_of(value) for name, value in within.items()
+    }
 
 
-def _built(cls: type[Any], path: Path, manifest: Manifest, attributes: dict[str, Any], prefix: str = "") -> Any:
+def _built(
+    cls: type[Any], path: Path, manifest: Manifest, attributes: dict[str, Any], prefix: str = ""
+) -> Any:
     """A record of the arrays that the manifest lists below `prefix`, and of its attributes."""
     layout, values = layout_of(cls), dict(attributes)  # type: ignore[arg-type]
     for name, within in layout.records.items():
@@ -293,7 +322,9 @@ def _built(cls: type[Any], path: Path, manifest: Manifest, attributes: dict[str,
 
 
 def _converted(name: str, value: Any, spec: Array) -> Any:
-    """A value in the dtype that it is stored in; a zarr array is in its place already and returned unchanged."""
+    """A value in the dtype that it is stored in; a zarr array is in its place already and returned
+    unchanged.
+    """
     if not isinstance(value, np.ndarray | StoredArray):
         return value
     values = np.asarray(value)
@@ -301,7 +332,11 @@ def _converted(name: str, value: Any, spec: Array) -> Any:
         raise ValueError(f"{name} is {values.dtype}, expected {spec.dtype}")
     with np.errstate(over="ignore"):  # what is infinite then is refused below
         converted = values.astype(spec.dtype, copy=False)
-    if converted is not values and converted.dtype.kind in "iu" and not np.array_equal(converted, values):
+    if (
+        converted is not values
+        and converted.dtype.kind in "iu"
+        and not np.array_equal(converted, values)
+    ):
         raise ValueError(f"{name} holds values that {spec.dtype} does not have")
     if converted.dtype.kind == "f" and not spec.any_value and not np.isfinite(converted).all():
         raise ValueError(f"{name} holds {np.sum(~np.isfinite(converted))} non-finite values")

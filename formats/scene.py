@@ -1,4 +1,6 @@
-"""`scene/3`: the exported scene: PLY for viewers, ragged arrays for us, a label dictionary and a summary."""
+"""`scene/3`: the exported scene: PLY for viewers, ragged arrays for us, a label dictionary and a
+summary.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +26,16 @@ RAGGED = ("means", "log_scales", "quats", "sh0", "logit_opacities", "sh1", "sh2"
 class Scene:
     """N Gaussians sorted by SH degree, stably; raw float32 parameters as in `gaussians/2`.
 
-    parameters: `means`, `log_scales`, `quats`, `logit_opacities`, `sh0` [N,1,3], `shN` [N,15,3] (zero above a
-                Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics `features` [N,C].
+    parameters: `means`, `log_scales`, `quats`, `logit_opacities`, `sh0` [N,1,3], `shN` [N,15,3]
+      (zero above a
+                Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics `features`
+                [N,C].
     cameras:    of the views it can be evaluated on.
     order:      i64 [N], row of each Gaussian in the checkpoint.
-    labels:     i32 [N] class index, -1 none; None without semantics. label_names, label_embeddings f32 [L, C].
-    summary:    counts, bytes, what was left out and why, and where the scene's `formats.world.World` is another.
+    labels:     i32 [N] class index, -1 none; None without semantics. label_names, label_embeddings
+      f32 [L, C].
+    summary:    counts, bytes, what was left out and why, and where the scene's
+      `formats.world.World` is another.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.scene/3"
@@ -44,9 +50,11 @@ class Scene:
     def write(self, out: Path) -> dict[str, int]:
         """Fill the directory that `artifact.publish` yields; returns bytes by part.
 
-        Choices: `scene.ply` is trimmed to the highest degree in use; `scene_d<k>.ply` hold each degree apart, each
-        valid on its own; all are in the source's world. Features are 16-bit fixed point: as small as halves, 20 times
-        as exact. Degrees are stored in the checkpoint's order, which they then tell.
+        Choices: `scene.ply` is trimmed to the highest degree in use; `scene_d<k>.ply` hold each
+          degree apart, each
+        valid on its own; all are in the source's world. Features are 16-bit fixed point: as small
+        as halves, 20 times as exact. Degrees are stored in the checkpoint's order, which they then
+        tell.
         """
         p, degrees, world = self.parameters, self.parameters["degrees"], World.read(self.summary)
         unsorted = np.empty_like(degrees)
@@ -60,12 +68,18 @@ class Scene:
                 of_degree = degrees == degree
                 part = {name: values[of_degree] for name, values in p.items()}
                 labels = None if self.labels is None else self.labels[of_degree]
-                write_ply(out / f"scene_d{degree}.ply", part, int(degree), labels, self.label_names, world)
+                write_ply(
+                    out / f"scene_d{degree}.ply", part, int(degree), labels, self.label_names, world
+                )
         bands = {}
         for band in range(1, top + 1):
             rows = p["shN"][degrees >= band, REST[band - 1] : REST[band]]
             bands[f"sh{band}"] = rows.reshape(len(rows), -1)
-        steps = {name: float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0 for name in ("features",) if name in p}
+        steps = {
+            name: float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0
+            for name in ("features",)
+            if name in p
+        }
         fixed = {name: np.round(p[name] / step).astype(np.int16) for name, step in steps.items()}
         stored = RaggedScene(
             **{name: p[name] for name in ("means", "log_scales", "quats", "logit_opacities")},
@@ -94,12 +108,17 @@ class Scene:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """The exported scene at `path`, all in memory. Raises InputError naming the damaged file and the remedy."""
+        """The exported scene at `path`, all in memory. Raises InputError naming the damaged file
+        and the remedy.
+        """
         path = Path(path)
         stored = RaggedScene.read(path)
         order = np.argsort(stored.degrees, kind="stable")
         degrees = stored.degrees[order]
-        parameters = {name: getattr(stored, name) for name in ("means", "log_scales", "quats", "logit_opacities")}
+        parameters = {
+            name: getattr(stored, name)
+            for name in ("means", "log_scales", "quats", "logit_opacities")
+        }
         parameters["sh0"] = stored.sh0[:, None]
         parameters["shN"] = np.zeros((len(order), 15, 3), np.float32)
         for band in range(1, int(degrees.max(initial=0)) + 1):
@@ -109,15 +128,29 @@ class Scene:
         parameters["degrees"] = degrees
         for name, step in stored.steps.items():
             parameters[name] = getattr(stored, name) * np.float32(step)
-        names = read_label_names(path, artifact.read_manifest(path)) if stored.labels is not None else None
-        return cls(parameters, stored.cameras, order, stored.labels, names, stored.label_embeddings, stored.summary)
+        names = (
+            read_label_names(path, artifact.read_manifest(path))
+            if stored.labels is not None
+            else None
+        )
+        return cls(
+            parameters,
+            stored.cameras,
+            order,
+            stored.labels,
+            names,
+            stored.label_embeddings,
+            stored.summary,
+        )
 
 
 @dataclass
 class RaggedScene(Record):
-    """`Scene` as stored: a Gaussian pays only for the SH bands that it keeps, and for features in 16-bit fixed point.
+    """`Scene` as stored: a Gaussian pays only for the SH bands that it keeps, and for features in
+    16-bit fixed point.
 
-    All but `degrees` are in order of degree. sh1, sh2, sh3: rows of the Gaussians that keep the band. steps: what an
+    All but `degrees` are in order of degree. sh1, sh2, sh3: rows of the Gaussians that keep the
+      band. steps: what an
     integer of `features` counts.
     """
 
@@ -127,7 +160,9 @@ class RaggedScene(Record):
     quats: Annotated[np.ndarray, Array("float32", ("gaussian", 4), "wxyz")]
     logit_opacities: Annotated[np.ndarray, Array("float32", ("gaussian",))]
     sh0: Annotated[np.ndarray, Array("float32", ("gaussian", 3))]
-    degrees: Annotated[np.ndarray, Array("uint8", ("gaussian",), "highest SH band, in the checkpoint's order")]
+    degrees: Annotated[
+        np.ndarray, Array("uint8", ("gaussian",), "highest SH band, in the checkpoint's order")
+    ]
     cameras: Cameras
     steps: dict[str, float]
     summary: dict[str, Any]
@@ -135,7 +170,9 @@ class RaggedScene(Record):
     sh2: Annotated[np.ndarray | None, Array("float32", ("gaussian_2", 15))] = None
     sh3: Annotated[np.ndarray | None, Array("float32", ("gaussian_3", 21))] = None
     features: Annotated[np.ndarray | None, Array("int16", ("gaussian", "channel"), "a step")] = None
-    labels: Annotated[np.ndarray | None, Array("int32", ("gaussian",), "class index, -1 none")] = None
+    labels: Annotated[np.ndarray | None, Array("int32", ("gaussian",), "class index, -1 none")] = (
+        None
+    )
     label_embeddings: Annotated[np.ndarray | None, Array("float32", ("label", "channel"))] = None
 
 
@@ -145,4 +182,6 @@ def read_label_names(path: Path, manifest: Manifest) -> list[str]:
 
 
 def _bytes_of(out: Path, names: tuple[str, ...]) -> int:
-    return sum(file.stat().st_size for name in names for file in (out / name).rglob("*") if file.is_file())
+    return sum(
+        file.stat().st_size for name in names for file in (out / name).rglob("*") if file.is_file()
+    )

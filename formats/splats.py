@@ -1,4 +1,6 @@
-"""Splats as other programs keep them: PLY, Niantic's SPZ, .splat, and the folder that 3DGS writes."""
+"""Splats as other programs keep them: PLY, Niantic's SPZ, .splat, and the folder that 3DGS
+writes.
+"""
 
 from __future__ import annotations
 
@@ -19,25 +21,39 @@ READ = (".ply", ".spz", ".splat")
 OTHERS = (".ksplat", ".sog", ".sogs", ".lcc", ".rad")
 REMEDY = "export it as PLY, for example with SuperSplat"
 LARGEST = 512 << 20  # bytes of a .splat, and of an SPZ unpacked: 8 million Gaussians of degree 3
-SPZ = struct.Struct("<4sIIBBBx")  # magic, version, Gaussians, degree, bits of a coordinate's fraction, flags
-# SPZ looks along -z, y up; these change their sign with y and z, of the 15 coefficients beyond band 0
+# magic, version, Gaussians, degree, bits of a coordinate's fraction, flags
+SPZ = struct.Struct("<4sIIBBBx")
+# SPZ looks along -z, y up; these change their sign with y and z, of the 15 coefficients beyond band
+# 0
 TURNED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
 def is_splat(name: str) -> bool:
     """Whether a path is called like a splat, or is a folder as 3DGS writes it."""
-    return Path(name).suffix.lower() in READ + OTHERS or os.path.isdir(os.path.join(name, "point_cloud"))
+    return Path(name).suffix.lower() in READ + OTHERS or os.path.isdir(
+        os.path.join(name, "point_cloud")
+    )
 
 
 def splat_file(path: Path) -> Path:
-    """The file of a splat: itself, or of 3DGS' output folder the PLY of the last iteration. Raises InputError."""
+    """The file of a splat: itself, or of 3DGS' output folder the PLY of the last iteration. Raises
+    InputError.
+    """
     if os.path.isdir(path):
-        found = [ply for ply in path.glob("point_cloud/iteration_*/point_cloud.ply") if _iteration(ply) >= 0]
+        found = [
+            ply
+            for ply in path.glob("point_cloud/iteration_*/point_cloud.ply")
+            if _iteration(ply) >= 0
+        ]
         if not found:
-            raise InputError(f"{path} holds no point_cloud/iteration_*/point_cloud.ply; name the file of a splat")
+            raise InputError(
+                f"{path} holds no point_cloud/iteration_*/point_cloud.ply; name the file of a splat"
+            )
         return max(found, key=_iteration)
     if path.suffix.lower() in OTHERS:
-        raise InputError(f"{path}: {path.suffix.lower()} is not read ({', '.join(READ)} are); {REMEDY}")
+        raise InputError(
+            f"{path}: {path.suffix.lower()} is not read ({', '.join(READ)} are); {REMEDY}"
+        )
     regular(path, "name the file of a splat")
     return path
 
@@ -47,8 +63,11 @@ def _iteration(ply: Path) -> int:
     return int(number) if number.isdecimal() else -1
 
 
-def read_splats(path: Path, world: World = HERE) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
-    """Raw parameters, degree and labels, as `ply.read_ply`, of any file or folder that `splat_file` takes.
+def read_splats(
+    path: Path, world: World = HERE
+) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
+    """Raw parameters, degree and labels, as `ply.read_ply`, of any file or folder that `splat_file`
+    takes.
 
     Args:   world: to bring the Gaussians into, from that of its source.
     Raises: InputError naming the file.
@@ -60,16 +79,27 @@ def read_splats(path: Path, world: World = HERE) -> tuple[dict[str, np.ndarray],
         raise InputError(f"{path} has more than the {LARGEST >> 20} MiB that are read; thin it out")
     parameters, degree = (_spz if path.suffix.lower() == ".spz" else _splat)(path)
     parameters = usable(path, parameters)[0]
-    moved = {"means": world.inward(parameters["means"]), "log_scales": parameters["log_scales"] - np.log(world.scale)}
-    return parameters | {name: values.astype(np.float32) for name, values in moved.items()}, degree, None
+    moved = {
+        "means": world.inward(parameters["means"]),
+        "log_scales": parameters["log_scales"] - np.log(world.scale),
+    }
+    return (
+        parameters | {name: values.astype(np.float32) for name, values in moved.items()},
+        degree,
+        None,
+    )
 
 
 def _splat(path: Path) -> tuple[dict[str, np.ndarray], int]:
     """Antimatter15's 32 bytes a Gaussian: centre, scales, RGBA, quaternion."""
-    row = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+    row = np.dtype(
+        [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]
+    )
     data = path.read_bytes()
     if len(data) % row.itemsize:
-        raise InputError(f"{path} is cut or no .splat: {len(data)} bytes are no multiple of 32; {REMEDY}")
+        raise InputError(
+            f"{path} is cut or no .splat: {len(data)} bytes are no multiple of 32; {REMEDY}"
+        )
     rows = np.frombuffer(data, row)
     with np.errstate(divide="ignore", invalid="ignore"):  # scales of 0 and below
         log_scales = np.log(rows["scales"])
@@ -93,10 +123,21 @@ def _spz(path: Path) -> tuple[dict[str, np.ndarray], int]:
         raise InputError(f"{path} is cut or no SPZ of version 2 or 3 ({error}); {REMEDY}") from None
     magic, version, n, degree, bits, _ = SPZ.unpack_from(data.ljust(SPZ.size, b"\0"))
     if magic != b"NGSP" or version not in (2, 3) or degree not in REST:
-        raise InputError(f"{path} is no SPZ of version 2 or 3 ({magic!r}, version {version}); {REMEDY}")
-    widths = {"means": 9, "alphas": 1, "colors": 3, "scales": 3, "quats": version + 1, "sh": 3 * REST[degree]}
+        raise InputError(
+            f"{path} is no SPZ of version 2 or 3 ({magic!r}, version {version}); {REMEDY}"
+        )
+    widths = {
+        "means": 9,
+        "alphas": 1,
+        "colors": 3,
+        "scales": 3,
+        "quats": version + 1,
+        "sh": 3 * REST[degree],
+    }
     if len(data) < SPZ.size + n * sum(widths.values()):
-        raise InputError(f"{path} is cut, or has more than the {LARGEST >> 20} MiB that are read; {REMEDY}")
+        raise InputError(
+            f"{path} is cut, or has more than the {LARGEST >> 20} MiB that are read; {REMEDY}"
+        )
     planes, at = {}, SPZ.size
     for name, width in widths.items():
         planes[name] = np.frombuffer(data, np.uint8, n * width, at).reshape(n, width)
@@ -111,7 +152,8 @@ def _spz(path: Path) -> tuple[dict[str, np.ndarray], int]:
         quats * [1, 1, -1, -1],
         planes["alphas"][:, 0],
         (planes["colors"] / 255 - 0.5) / 0.15,
-        (planes["sh"].reshape(n, -1, 3).astype(np.float32) / 128 - 1) * TURNED[: REST[degree], None],
+        (planes["sh"].reshape(n, -1, 3).astype(np.float32) / 128 - 1)
+        * TURNED[: REST[degree], None],
     ), degree
 
 
@@ -122,10 +164,13 @@ def _three_bytes(stored: np.ndarray) -> np.ndarray:
 
 
 def _smallest_three(stored: np.ndarray) -> np.ndarray:
-    """Unit quaternions [N, 4] (wxyz) of u32 as bytes [N, 4]: the largest entry's place among x, y, z, w in the 2 upper
-    bits, the others in order, each a sign and 9 bits over 1/√2.
+    """Unit quaternions [N, 4] (wxyz) of u32 as bytes [N, 4]: the largest entry's place among x, y,
+    z, w in the 2 upper bits, the others in order, each a sign and 9 bits over 1/√2.
     """
-    words, rows = np.ascontiguousarray(stored).view("<u4")[:, 0].astype(np.int64), np.arange(len(stored))
+    words, rows = (
+        np.ascontiguousarray(stored).view("<u4")[:, 0].astype(np.int64),
+        np.arange(len(stored)),
+    )
     place, xyzw = words >> 30, np.zeros((len(words), 4))
     for entry in (3, 2, 1, 0):
         here = place != entry
@@ -137,7 +182,12 @@ def _smallest_three(stored: np.ndarray) -> np.ndarray:
 
 
 def _parameters(
-    means: np.ndarray, log_scales: np.ndarray, quats: np.ndarray, alphas: np.ndarray, sh0: np.ndarray, sh: np.ndarray
+    means: np.ndarray,
+    log_scales: np.ndarray,
+    quats: np.ndarray,
+    alphas: np.ndarray,
+    sh0: np.ndarray,
+    sh: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """Raw parameters; alphas: bytes [N]; sh0 [N, 3]; sh [N, K, 3]."""
     opacities = alphas / 255
@@ -145,5 +195,11 @@ def _parameters(
         logits = np.log(opacities / (1 - opacities))
     shN = np.zeros((len(means), 15, 3), np.float32)
     shN[:, : sh.shape[1]] = sh
-    found = {"means": means, "log_scales": log_scales, "quats": quats, "logit_opacities": logits, "sh0": sh0[:, None]}
+    found = {
+        "means": means,
+        "log_scales": log_scales,
+        "quats": quats,
+        "logit_opacities": logits,
+        "sh0": sh0[:, None],
+    }
     return {name: values.astype(np.float32) for name, values in found.items()} | {"shN": shN}

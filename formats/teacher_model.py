@@ -1,4 +1,6 @@
-"""A 2D teacher as its user brings it: `NAME.onnx`, and `NAME.toml` beside it that says how to use it."""
+"""A 2D teacher as its user brings it: `NAME.onnx`, and `NAME.toml` beside it that says how to use
+it.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ class TeacherModel:
     """What `read_teacher` returns; docs/teachers.md says what each key means to a user.
 
     path:      the image encoder, `[1, 3, H, W]` float32 -> `[1, C, h, w]`.
-    output:    "features", or "logits" of a closed-set segmenter: channel = index into the label list.
+    output:    "features", or "logits" of a closed-set segmenter: channel = index into the label
+      list.
     guessed:   whether the TOML leaves that out, and labels that are names alone, without `text`,
                are taken for a segmenter's.
     tensor:    the graph's output, or None: the one that fits.
@@ -42,7 +45,8 @@ class TeacherModel:
     size:      (H, W) that the model takes, or None: any whose sides are multiples of `multiple`.
     base:      long side in pixels that an image is resized to at scale 1, or None: its own.
     origin:    where it was fetched, sha256: of the model then (`model_sha256`); None if it was not.
-    labels:    table of names and embeddings; text, tokenizer: encoder of any words; prompt: what a name is put into.
+    labels:    table of names and embeddings; text, tokenizer: encoder of any words; prompt: what a
+      name is put into.
     """
 
     path: Path
@@ -78,7 +82,8 @@ class TeacherModel:
         """Raises InputError if the encoder is not the one whose checksum was recorded."""
         if self.sha256 is not None and (found := model_sha256(self.path)) != self.sha256:
             raise InputError(
-                f"{self.path} has the sha256 {found}, {self.settings} says {self.sha256}: it was damaged or replaced; "
+                f"{self.path} has the sha256 {found}, {self.settings} says {self.sha256}: it was "
+                "damaged or replaced; "
                 f"remove the folder and fetch it again (chebsplat get-teacher), or correct `sha256`"
             )
 
@@ -93,7 +98,9 @@ class TeacherModel:
 
     def digest(self) -> str:
         """One sha256 over these files."""
-        return hashlib.sha256("\n".join(sha256_file(file) for file in self.files()).encode()).hexdigest()
+        return hashlib.sha256(
+            "\n".join(sha256_file(file) for file in self.files()).encode()
+        ).hexdigest()
 
 
 def read_teacher(path: Path) -> TeacherModel:
@@ -106,12 +113,15 @@ def read_teacher(path: Path) -> TeacherModel:
         raise InputError(f"{path} is not an .onnx file; teacher.model names the image encoder")
     if not settings.is_file():
         raise InputError(
-            f"{settings} is missing; write it beside the model, with at least mean, std and labels (docs/teachers.md)"
+            f"{settings} is missing; write it beside the model, with at least mean, std and "
+            "labels (docs/teachers.md)"
         )
     values = parse_toml(settings, "correct it (docs/teachers.md)")
     for key, value in values.items():
         _check(settings, key, value)
-    values = {key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+    values = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
+    }
     for key in FILES:
         if key in values and not (key == "text" and values[key] == TEXT_PACKAGE):
             values[key] = settings.parent / values[key]
@@ -124,18 +134,29 @@ def read_teacher(path: Path) -> TeacherModel:
             if read_label_table(teacher.labels)[1] is None:
                 teacher = replace(teacher, output="logits", guessed=True)
     if teacher.output == "features" and teacher.labels is None and teacher.text is None:
-        raise InputError(f"{settings} has neither `labels` nor `text`: no label could be told; add one of them")
+        raise InputError(
+            f"{settings} has neither `labels` nor `text`: no label could be told; add one of them"
+        )
     if teacher.output == "logits" and teacher.labels is None:
-        raise InputError(f"{settings} has no `labels`: the names of the channels are needed; add them")
+        raise InputError(
+            f"{settings} has no `labels`: the names of the channels are needed; add them"
+        )
     if isinstance(teacher.text, Path) and teacher.tokenizer is None:
-        raise InputError(f"{settings} has `text` without `tokenizer`; add the tokenizer.json of the text encoder")
+        raise InputError(
+            f"{settings} has `text` without `tokenizer`; add the tokenizer.json of the text encoder"
+        )
     if teacher.size is not None and any(side % teacher.multiple for side in teacher.size):
-        raise InputError(f"{settings}: size {list(teacher.size)} is not a multiple of {teacher.multiple}; correct one")
+        raise InputError(
+            f"{settings}: size {list(teacher.size)} is not a multiple of "
+            f"{teacher.multiple}; correct one"
+        )
     return teacher
 
 
 def _is_list(value: Any, kinds: tuple[type, ...], length: int, low: float, high: float) -> bool:
-    whole = isinstance(value, list) and len(value) == length and all(type(v) in kinds for v in value)
+    whole = (
+        isinstance(value, list) and len(value) == length and all(type(v) in kinds for v in value)
+    )
     return whole and all(low <= v <= high for v in value)
 
 
@@ -155,15 +176,24 @@ RULES = {
     "std": ("three numbers above 0", lambda v: _is_list(v, (int, float), 3, 1e-6, 1e3)),
     "order": ('"RGB" or "BGR"', lambda v: v in ("RGB", "BGR")),
     "resample": (", ".join(RESAMPLING), lambda v: v in RESAMPLING),
-    "size": (f"[height, width], 1 to {MAX_SIDE} pixels", lambda v: _is_list(v, (int,), 2, 1, MAX_SIDE)),
+    "size": (
+        f"[height, width], 1 to {MAX_SIDE} pixels",
+        lambda v: _is_list(v, (int,), 2, 1, MAX_SIDE),
+    ),
     "multiple": (f"a whole number, 1 to {MAX_SIDE}", _is_side),
     "base": (f"a whole number of pixels, 1 to {MAX_SIDE}", _is_side),
     "origin": ("a text", _is_text),
-    "sha256": ("64 hexadecimal digits", lambda v: isinstance(v, str) and re.fullmatch("[0-9a-f]{64}", v) is not None),
+    "sha256": (
+        "64 hexadecimal digits",
+        lambda v: isinstance(v, str) and re.fullmatch("[0-9a-f]{64}", v) is not None,
+    ),
     "labels": ("a file's name", _is_text),
     "text": ("a file's name", _is_text),
     "tokenizer": ("a file's name", _is_text),
-    "prompt": ('text with one {} in it, such as "a photo of a {}"', lambda v: _is_text(v) and v.count("{}") == 1),
+    "prompt": (
+        'text with one {} in it, such as "a photo of a {}"',
+        lambda v: _is_text(v) and v.count("{}") == 1,
+    ),
 }
 
 
@@ -180,13 +210,16 @@ def _check(settings: Path, key: str, value: Any) -> None:
 def _check_range(settings: Path, values: dict[str, Any]) -> None:
     """Mean and std are of colours in 0 to 1: with those of 0 to 255 all photos would look alike.
 
-    Choices: a std of 1 beside such a mean is of colours in 0 to 255, too, as Caffe's models have it.
+    Choices: a std of 1 beside such a mean is of colours in 0 to 255, too, as Caffe's models have
+      it.
     """
     large = [key for key in ("mean", "std") if max(values.get(key, [0])) > LARGEST]
     if large == ["mean"] and {*values.get("std", ())} == {1}:
         large = ["mean", "std"]
     if large:
-        advice = ", ".join(f"{key} = {[float(f'{v / 255:.4g}') for v in values[key]]}" for key in large)
+        advice = ", ".join(
+            f"{key} = {[float(f'{v / 255:.4g}') for v in values[key]]}" for key in large
+        )
         what = f"{' and '.join(large)} of colours in 0 to 255, where those of 0 to 1 are needed"
         raise InputError(f"{settings}: {what}; write {advice}")
 
@@ -194,7 +227,8 @@ def _check_range(settings: Path, values: dict[str, Any]) -> None:
 def read_label_table(path: Path) -> tuple[list[str], np.ndarray | None]:
     """Names [L] and embeddings f32 [L, C], or None where the file holds names alone.
 
-    Args: path: .npz with `names` and, for features, `embeddings`; or a text file of names, one a line.
+    Args: path: .npz with `names` and, for features, `embeddings`; or a text file of names, one a
+      line.
     Raises: InputError naming the file and the remedy.
     """
     if path.suffix != ".npz":
@@ -202,8 +236,15 @@ def read_label_table(path: Path) -> tuple[list[str], np.ndarray | None]:
 
     arrays = read_npz(path, ("names", "embeddings"), "write it again, with names and embeddings")
     listed, embeddings = arrays.get("names"), arrays.get("embeddings")
-    if listed is None or listed.ndim != 1 or listed.dtype.kind != "U" or not 0 < len(set(listed)) == len(listed):
-        raise InputError(f"{path}: names are missing, occur twice or are no list of words; write it again")
+    if (
+        listed is None
+        or listed.ndim != 1
+        or listed.dtype.kind != "U"
+        or not 0 < len(set(listed)) == len(listed)
+    ):
+        raise InputError(
+            f"{path}: names are missing, occur twice or are no list of words; write it again"
+        )
     names = [str(name) for name in listed]
     check_names(names, "names", path, "write it again")
     if embeddings is None:
@@ -211,7 +252,8 @@ def read_label_table(path: Path) -> tuple[list[str], np.ndarray | None]:
     rows = finite32(embeddings)
     if rows is None or rows.ndim != 2 or len(rows) != len(names) or not rows.size:
         raise InputError(
-            f"{path}: embeddings {embeddings.dtype} {embeddings.shape} do not fit {len(names)} names, or are not "
+            f"{path}: embeddings {embeddings.dtype} {embeddings.shape} do not fit {len(names)} "
+            "names, or are not "
             "finite; write it again"
         )
     return names, rows
@@ -230,10 +272,15 @@ def read_label_set(path: Path) -> dict[str, list[str]]:
         if not name and not others:
             continue
         if not name or name in words_of:
-            raise InputError(f"{path}, line {number}: a name is {'given twice' if name else 'missing'}; correct it")
+            raise InputError(
+                f"{path}, line {number}: a name is "
+                f"{'given twice' if name else 'missing'}; correct it"
+            )
         words = [name, *(word.strip() for word in others.split(",") if word.strip())]
         words_of[name] = list(dict.fromkeys(words))
         check_names(words_of[name], f"line {number}", path, "correct it")
     if not 0 < len(words_of) <= MAX_LABELS:
-        raise InputError(f"{path} holds {len(words_of)} labels; 1 to {MAX_LABELS} are possible, one name a line")
+        raise InputError(
+            f"{path} holds {len(words_of)} labels; 1 to {MAX_LABELS} are possible, one name a line"
+        )
     return words_of

@@ -1,7 +1,9 @@
-"""Named arrays in files: safetensors of ours, checked for dtype and shape on reading; .npy and .npz of users.
+"""Named arrays in files: safetensors of ours, checked for dtype and shape on reading; .npy and .npz
+of users.
 
-What .npy and .npz declare is held against their bytes before anything is allocated. Measured traps this closes: a
-header of 100 bytes that declares terabytes, a zip of 400 KB that unpacks to 3 GB, a FIFO.
+What .npy and .npz declare is held against their bytes before anything is allocated. Measured traps
+this closes: a header of 100 bytes that declares terabytes, a zip of 400 KB that unpacks to 3 GB, a
+  FIFO.
 """
 
 from __future__ import annotations
@@ -33,10 +35,14 @@ _BROKEN = (OSError, ValueError, EOFError, RuntimeError, MemoryError, KeyError, T
 
 
 def write_tensors(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays. Raises ValueError on a name with a non-finite value: nothing bad is ever published."""
+    """Write named arrays. Raises ValueError on a name with a non-finite value: nothing bad is ever
+    published.
+    """
     for name, array in arrays.items():
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-            raise ValueError(f"{path.name}: {name} holds {np.sum(~np.isfinite(array))} non-finite values")
+            raise ValueError(
+                f"{path.name}: {name} holds {np.sum(~np.isfinite(array))} non-finite values"
+            )
     path.write_bytes(save({name: np.ascontiguousarray(array) for name, array in arrays.items()}))
 
 
@@ -46,7 +52,8 @@ def read_tensors(
     """Read a listed file after comparing its digest.
 
     Args:
-      specs: what must be there, e.g. ("float32", "n", 3); a string is a size that has to agree wherever it occurs.
+      specs: what must be there, e.g. ("float32", "n", 3); a string is a size that has to agree
+        wherever it occurs.
     Raises: InputError naming the file, the array and the remedy.
     """
     path = artifact.checked(root, manifest, name)
@@ -60,13 +67,17 @@ def read_tensors(
             raise InputError(f"{path} has no array {key}; {remedy_of(root)}")
         stored = arrays[key].shape
         if arrays[key].dtype.name != dtype:
-            raise InputError(f"{path}: {key} is {arrays[key].dtype}, expected {dtype}; {remedy_of(root)}")
+            raise InputError(
+                f"{path}: {key} is {arrays[key].dtype}, expected {dtype}; {remedy_of(root)}"
+            )
         fits = len(stored) == len(shape) and all(
             n == (sizes.setdefault(want, n) if isinstance(want, str) else want)
             for n, want in zip(stored, shape, strict=True)
         )
         if not fits:
-            raise InputError(f"{path}: {key} has shape {stored}, expected {tuple(shape)}; {remedy_of(root)}")
+            raise InputError(
+                f"{path}: {key} has shape {stored}, expected {tuple(shape)}; {remedy_of(root)}"
+            )
     return arrays
 
 
@@ -76,8 +87,12 @@ def read_npy(path: Path, remedy: str, largest: int = LARGEST) -> np.ndarray:
         return _array(handle, path.stat().st_size, largest)
 
 
-def read_npz(path: Path, wanted: Sequence[str], remedy: str, largest: int = LARGEST) -> dict[str, np.ndarray]:
-    """Those of the wanted arrays that an .npz file holds; the others stay packed. Raises as `read_npy`."""
+def read_npz(
+    path: Path, wanted: Sequence[str], remedy: str, largest: int = LARGEST
+) -> dict[str, np.ndarray]:
+    """Those of the wanted arrays that an .npz file holds; the others stay packed. Raises as
+    `read_npy`.
+    """
     arrays: dict[str, np.ndarray] = {}
     with _readable(path, ".npz", remedy), zipfile.ZipFile(path) as archive:
         members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
@@ -109,15 +124,23 @@ def _readable(path: Path, kind: str, remedy: str) -> Iterator[None]:
 
 
 def _array(handle: IO[bytes], size: int, largest: int) -> np.ndarray:
-    """The array that begins here, in a file (or a member of one) of `size` bytes. Raises ValueError."""
+    """The array that begins here, in a file (or a member of one) of `size` bytes. Raises
+    ValueError.
+    """
     version = np.lib.format.read_magic(handle)
-    read_header: Any = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    read_header: Any = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
     shape, _, dtype = read_header(handle)
     if dtype.hasobject:
         raise ValueError("it holds pickled objects, which are not read")
     declared = math.prod(shape) * dtype.itemsize
     if handle.tell() + declared != size:
-        raise ValueError(f"it declares {declared:,} bytes and holds {max(size - handle.tell(), 0):,}")
+        raise ValueError(
+            f"it declares {declared:,} bytes and holds {max(size - handle.tell(), 0):,}"
+        )
     if declared > largest:
         raise ValueError(f"it holds {declared:,} bytes, at most {largest:,} are read")
     handle.seek(0)

@@ -1,4 +1,6 @@
-"""Videos from outside: the one door to PyAV's reader. Containers that cameras write, recognised by content."""
+"""Videos from outside: the one door to PyAV's reader. Containers that cameras write, recognised by
+content.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ if TYPE_CHECKING:
     import numpy as np
 
 SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".3gp")
-CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"  # FFmpeg reads playlists, too, which name other files
+# FFmpeg reads playlists, too, which name other files
+CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"
 HDR = (16, 18)  # transfer functions PQ and HLG, ITU-T H.273
 
 
@@ -31,8 +34,8 @@ def is_video(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Video:
-    """width, height: as it is meant to be seen; n_frames: about how many there are; rate: frames/s, about; hdr: whether
-    its colours are coded for a brighter screen than a photo's.
+    """width, height: as it is meant to be seen; n_frames: about how many there are; rate: frames/s,
+    about; hdr: whether its colours are coded for a brighter screen than a photo's.
     """
 
     width: int
@@ -43,7 +46,9 @@ class Video:
 
 
 class Shown:
-    """A decoded frame as it is meant to be seen. time: seconds, as the file says; None where it does not."""
+    """A decoded frame as it is meant to be seen. time: seconds, as the file says; None where it
+    does not.
+    """
 
     def __init__(self, frame: Any, width: int, height: int):
         self.time: float | None = frame.time
@@ -57,7 +62,9 @@ class Shown:
             width, height = max(round(width * factor), 1), max(round(height * factor), 1)
         if self._turns % 2:
             width, height = height, width
-        array = self._frame.to_ndarray(format=kind, width=width, height=height, interpolation="AREA")
+        array = self._frame.to_ndarray(
+            format=kind, width=width, height=height, interpolation="AREA"
+        )
         return np.ascontiguousarray(np.rot90(array, self._turns))
 
 
@@ -72,7 +79,8 @@ def require_av(path: Path) -> Any:
         return import_module("av")
     except ImportError:
         raise InputError(
-            f"{path} is a video, which the package av reads: .venv/bin/pip install -e '.[video]' installs it"
+            f"{path} is a video, which the package av reads: .venv/bin/pip install -e '.[video]' "
+            "installs it"
         ) from None
 
 
@@ -85,11 +93,19 @@ def describe(path: Path) -> Video:
         width, height = _seen_size(path, stream, first)
         rate = float(stream.average_rate or stream.guessed_rate or 30)
         seconds = container.duration / 1e6 if container.duration else 0
-        return Video(width, height, max(stream.frames or round(seconds * rate), 1), rate, first.color_trc in HDR)
+        return Video(
+            width,
+            height,
+            max(stream.frames or round(seconds * rate), 1),
+            rate,
+            first.color_trc in HDR,
+        )
 
 
 def frames(path: Path) -> Iterator[Shown]:
-    """All frames, in the order in which they are shown. Raises InputError naming the file, where it is damaged."""
+    """All frames, in the order in which they are shown. Raises InputError naming the file, where it
+    is damaged.
+    """
     size: tuple[int, int] | None = None
     with _opened(path) as (container, stream):
         for frame in container.decode(stream):
@@ -98,11 +114,17 @@ def frames(path: Path) -> Iterator[Shown]:
 
 
 def _seen_size(path: Path, stream: Any, frame: Any) -> tuple[int, int]:
-    """(width, height) of a frame with square pixels, upright. Raises InputError if it is too large."""
-    width, height = max(round(frame.width * float(stream.sample_aspect_ratio or 1)), 1), frame.height
+    """(width, height) of a frame with square pixels, upright. Raises InputError if it is too
+    large.
+    """
+    width, height = (
+        max(round(frame.width * float(stream.sample_aspect_ratio or 1)), 1),
+        frame.height,
+    )
     if width * height > MAX_PIXELS or max(width, height) > MAX_SIDE:
         raise InputError(
-            f"{path} is too large ({width}x{height}; {MAX_PIXELS // 10**6} megapixels are read); reduce it"
+            f"{path} is too large ({width}x{height}; {MAX_PIXELS // 10**6} megapixels are read); "
+            "reduce it"
         )
     return (height, width) if quarters(frame) % 2 else (width, height)
 
@@ -122,4 +144,6 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
             yield container, stream
     except (av.error.FFmpegError, OSError) as error:
         fault = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"{path} is not a readable video ({fault}); copy or export it again") from None
+        raise InputError(
+            f"{path} is not a readable video ({fault}); copy or export it again"
+        ) from None

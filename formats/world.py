@@ -1,4 +1,6 @@
-"""Where the scene of artifacts lies in its source's world: moved and scaled where single precision asks for it."""
+"""Where the scene of artifacts lies in its source's world: moved and scaled where single precision
+asks for it.
+"""
 
 from __future__ import annotations
 
@@ -10,25 +12,29 @@ import numpy as np
 
 from chebsplat.errors import InputError
 
-EXTENTS = (0.1, 1000.0)  # scene units that cameras may lie apart: near planes and thresholds are made for rooms
+# scene units that cameras may lie apart: near planes and thresholds are made for rooms
+EXTENTS = (0.1, 1000.0)
 FARTHEST = 1000.0  # extents from the origin: float32 tells 6e-5 of an extent apart there
 
 
 @dataclass(frozen=True)
 class World:
-    """A point of the source's world is origin + scale · that of the artifacts. Depths are scaled alike."""
+    """A point of the source's world is origin + scale · that of the artifacts. Depths are scaled
+    alike.
+    """
 
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
     scale: float = 1.0
 
     @classmethod
     def of(cls, eyes: np.ndarray) -> Self:
-        """The world for a scene whose cameras stand at `eyes` [V, 3] of its source's; those that are not finite tell
-        nothing.
+        """The world for a scene whose cameras stand at `eyes` [V, 3] of its source's; those that
+        are not finite tell nothing.
 
-        Choices: a scene of sane size about a sane origin stays as it is. Others are brought to an extent of 1 to 10
-          units by a power of ten, and about the origin by a round number near the middle of the cameras, so that a
-          scene that was moved or scaled by such a number is as before. One place alone has no extent: its scale stays.
+        Choices: a scene of sane size about a sane origin stays as it is. Others are brought to an
+          extent of 1 to 10 units by a power of ten, and about the origin by a round number near the
+          middle of the cameras, so that a scene that was moved or scaled by such a number is as
+          before. One place alone has no extent: its scale stays.
           A few cameras gone astray decide nothing: middle and extent are medians.
         """
         eyes = eyes[np.isfinite(eyes).all(1)]
@@ -46,16 +52,24 @@ class World:
 
     @classmethod
     def read(cls, notes: Mapping[str, Any]) -> Self:
-        """The world that an artifact's notes tell of; the artifacts' own where they tell of none. Raises InputError."""
+        """The world that an artifact's notes tell of; the artifacts' own where they tell of none.
+        Raises InputError.
+        """
         held = notes.get("world")
         if held is None:
             return cls()
         try:
             world = cls(tuple(map(float, held["origin"])), float(held["scale"]))
-            if not (np.isfinite(world.origin).all() and len(world.origin) == 3 and 0 < world.scale < np.inf):
+            if not (
+                np.isfinite(world.origin).all()
+                and len(world.origin) == 3
+                and 0 < world.scale < np.inf
+            ):
                 raise ValueError
         except (KeyError, TypeError, ValueError):
-            raise InputError(f"world {str(held)[:80]} is no place of a scene; make the artifact again") from None
+            raise InputError(
+                f"world {str(held)[:80]} is no place of a scene; make the artifact again"
+            ) from None
         return world
 
     @property
@@ -64,8 +78,14 @@ class World:
         return {} if self == HERE else {"world": {"origin": list(self.origin), "scale": self.scale}}
 
     def outward(self, points: np.ndarray) -> np.ndarray:
-        """Points [..., 3] in the source's world, f64; f32 and untouched where the worlds are one."""
-        return points if not self.notes else np.asarray(self.origin) + self.scale * points.astype(np.float64)
+        """Points [..., 3] in the source's world, f64; f32 and untouched where the worlds are
+        one.
+        """
+        return (
+            points
+            if not self.notes
+            else np.asarray(self.origin) + self.scale * points.astype(np.float64)
+        )
 
     def inward(self, points: np.ndarray) -> np.ndarray:
         """Points [..., 3] of the source's world in the artifacts'."""

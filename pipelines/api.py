@@ -1,4 +1,6 @@
-"""Python's way in: open a finished scene, bring a scene up to date, run one stage. The command line does the same."""
+"""Python's way in: open a finished scene, bring a scene up to date, run one stage. The command line
+does the same.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ def load(scene: str | Path) -> OpenedScene:
     Args: scene: its name, its photo folder, its folder in `work`, or an `export` artifact.
     Raises: ConfigError or InputError, which name what is missing and the remedy.
     """
-    return OpenedScene(Scene.read(artifact_of(str(scene), "export")), Path(scene), teacher_of(str(scene)))
+    return OpenedScene(
+        Scene.read(artifact_of(str(scene), "export")), Path(scene), teacher_of(str(scene))
+    )
 
 
 def train(
@@ -46,31 +50,43 @@ def train(
     Args:
       capture:  a folder of photos or another source, or the name of a scene.
       ablation: a named set of settings; cores: default: all.
-      settings: sections of settings by name, as `train={"steps": 1000}` (`chebsplat settings` lists them).
-    Raises: ConfigError or InputError before anything runs; ChebsplatError if a stage fails, whose log says why.
+      settings: sections of settings by name, as `train={"steps": 1000}` (`chebsplat settings` lists
+        them).
+    Raises: ConfigError or InputError before anything runs; ChebsplatError if a stage fails, whose
+      log says why.
     """
     used = device_of(device)
     chosen = plans(str(capture), None, settings, ablation, running=True, device=used)
     if execute(chosen, None, cores or os.cpu_count() or 1, used):
-        raise ChebsplatError(f"{capture} could not be finished; the lines above name the stage and its log")
+        raise ChebsplatError(
+            f"{capture} could not be finished; the lines above name the stage and its log"
+        )
     return load(store.work() / chosen[-1].title)
 
 
 def run_stage(
-    name: str, out: str | Path, inputs: Mapping[str, str | Path] | None = None, **settings: dict[str, Any]
+    name: str,
+    out: str | Path,
+    inputs: Mapping[str, str | Path] | None = None,
+    **settings: dict[str, Any],
 ) -> Path:
-    """Run one stage in this process and publish its artifact at `out`; nothing if it is there already.
+    """Run one stage in this process and publish its artifact at `out`; nothing if it is there
+    already.
 
-    Args: name: of a stage; inputs: artifacts by role (`chebsplat STAGE --help` lists them); settings: sections by name.
+    Args: name: of a stage; inputs: artifacts by role (`chebsplat STAGE --help` lists them);
+      settings: sections by name.
     Raises: ConfigError, InputError, DataFailure.
     """
     if name not in STAGES:
         near = suggest(name, STAGES, 1)
-        raise ConfigError(f"no stage is called {name}" + (f"; did you mean {near[0]}?" if near else ""))
+        raise ConfigError(
+            f"no stage is called {name}" + (f"; did you mean {near[0]}?" if near else "")
+        )
     stage, given = STAGES[name], {role: Path(path) for role, path in (inputs or {}).items()}
     needed = {role for role, _ in stage.inputs}
     if unfit := sorted(needed - given.keys()) or sorted(given.keys() - stage.roles.keys()):
-        raise ConfigError(f"{name} {'needs' if unfit[0] in needed else 'does not read'} inputs[{unfit[0]!r}]; "
+        raise ConfigError(f"{name} {'needs' if unfit[0] in needed else 'does not read'} "
+                          f"inputs[{unfit[0]!r}]; "
                           f"it needs {', '.join(sorted(needed)) or 'none'}")  # fmt: skip
     with TemporaryDirectory() as folder:
         config = Path(folder) / "settings.json"

@@ -43,8 +43,12 @@ def checked_stage(stage: str | None, chosen: list[Plan]) -> str | None:
         return None
     if stage not in STAGES:
         near = suggest(stage, STAGES, 1)
-        raise ConfigError(f"no stage is called {stage}" + (f"; did you mean {near[0]}?" if near else ""))
+        raise ConfigError(
+            f"no stage is called {stage}" + (f"; did you mean {near[0]}?" if near else "")
+        )
     for plan in chosen:
         if stage not in plan.targets:
-            raise ConfigError(f"{plan.title} leaves out {stage}: {plan.left_out.get(stage, 'not needed')}")
+            raise ConfigError(
+                f"{plan.title} leaves out {stage}: {plan.left_out.get(stage, 'not needed')}"
+            )
     return stage

@@ -2,8 +2,8 @@
 
 See docs/method.md, section 8.
 
-It is computed from the teacher, its words and reference images, and from nothing of a scene, so that what one scene
-learns about shape and meaning carries over to the next.
+It is computed from the teacher, its words and reference images, and from nothing of a scene, so
+that what one scene learns about shape and meaning carries over to the next.
 """
 
 from __future__ import annotations
@@ -35,18 +35,25 @@ CHECKED = 20_000  # pixels whose labels before and after are compared
 
 
 def run(job: Job) -> None:
-    """The directions of a teacher's features that scenes are trained in (docs/method.md, section 8).
+    """The directions of a teacher's features that scenes are trained in (docs/method.md, section
+    8).
 
     Reads no artifact: a teacher, its words and reference images. Writes `channels`.
     """
     settings = job.config.channels
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     if teacher.output != "features":
-        raise ConfigError(f"{teacher.settings}: output is {teacher.output}; only channels of features are reduced")
+        raise ConfigError(
+            f"{teacher.settings}: output is {teacher.output}; only channels of features are reduced"
+        )
     if (brought := shipped(teacher, settings)) is not None:
-        job.left_out("reference images", f"{brought.name} beside the teacher holds what comes of them")
+        job.left_out(
+            "reference images", f"{brought.name} beside the teacher holds what comes of them"
+        )
         job.facts |= {
-            name: value for name, value in read_manifest(brought, ChannelMap.SCHEMA).facts.items() if name != "left_out"
+            name: value
+            for name, value in read_manifest(brought, ChannelMap.SCHEMA).facts.items()
+            if name != "left_out"
         }
         ChannelMap.read(brought).write(job.out)
         return
@@ -60,7 +67,8 @@ def run(job: Job) -> None:
             moments = maths.Moments(n_channels)
             if words is not None and words.shape[1] != n_channels:
                 raise InputError(
-                    f"{teacher.path} has {n_channels} channels, {teacher.labels} embeds in {words.shape[1]}; export "
+                    f"{teacher.path} has {n_channels} channels, {teacher.labels} embeds in "
+                    f"{words.shape[1]}; export "
                     "them from one model"
                 )
         features = network.features(image, grid, (1.0,), False, name)
@@ -69,7 +77,9 @@ def run(job: Job) -> None:
         sample.append(rows[:: -(-len(rows) * count // CHECKED)])
         status["pixels"] = moments.count
     if moments is None or not np.trace(moments.products) > 0:
-        raise DataFailure(f"{teacher.path} gives zero features on all {count} reference images; export it again")
+        raise DataFailure(
+            f"{teacher.path} gives zero features on all {count} reference images; export it again"
+        )
     known = np.zeros((0, len(moments.products))) if words is None else words
     matrix, energy = maths.channel_map(moments, known, settings.n_channels)
     notes: dict[str, Any] = {"n_pixels": moments.count, "n_words": len(known), "n_images": count}
@@ -83,24 +93,37 @@ def run(job: Job) -> None:
 
 
 def shipped(teacher: TeacherModel, settings: ChannelsSection) -> Path | None:
-    """The artifact of this stage that lies beside the teacher, if it is of the same files and settings."""
+    """The artifact of this stage that lies beside the teacher, if it is of the same files and
+    settings.
+    """
     if not teacher.channels.is_dir():
         return None
     manifest, unnamed = read_manifest(teacher.channels, ChannelMap.SCHEMA), {"model"}
     asked = settings.model_dump(mode="json", exclude=unnamed)
-    given = {name: value for name, value in manifest.config["channels"].items() if name not in unnamed}
-    return teacher.channels if given == asked and manifest.facts.get("digest") == teacher.digest() else None
+    given = {
+        name: value for name, value in manifest.config["channels"].items() if name not in unnamed
+    }
+    return (
+        teacher.channels
+        if given == asked and manifest.facts.get("digest") == teacher.digest()
+        else None
+    )
 
 
 def vocabulary(job: Job, teacher: TeacherModel) -> np.ndarray | None:
     """Unit embeddings [L, C] of the teacher's table of words; None where it has none."""
     names, embeddings = read_label_table(teacher.labels) if teacher.labels else ([], None)
     if embeddings is None:
-        job.left_out("vocabulary", f"{teacher.settings} names no table of embeddings: directions go by energy alone")
+        job.left_out(
+            "vocabulary",
+            f"{teacher.settings} names no table of embeddings: directions go by energy alone",
+        )
         return None
     lengths = np.linalg.norm(embeddings, axis=1)
     if lengths.min() < 1e-6:
-        raise InputError(f"{teacher.labels}: the embedding of {names[lengths.argmin()]} is zero; write it again")
+        raise InputError(
+            f"{teacher.labels}: the embedding of {names[lengths.argmin()]} is zero; write it again"
+        )
     return embeddings / lengths[:, None]
 
 

@@ -1,4 +1,6 @@
-"""describe: the shape about each point of a surface: Chebyshev descriptors at four radii (Eqs 1-6)."""
+"""describe: the shape about each point of a surface: Chebyshev descriptors at four radii (Eqs
+1-6).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from chebsplat.stages.shape_models.surfaces import Cloud, scene_unit, surface_in
 
 
 def run(job: Job) -> None:
-    """What the point encoder sees of the points that depth or a sweep shows (docs/method.md, section 2).
+    """What the point encoder sees of the points that depth or a sweep shows (docs/method.md,
+    section 2).
 
     Reads `capture` and `points`. Writes `descriptors`. They are of no point where a scene shows too
     little of a surface.
@@ -23,7 +26,11 @@ def run(job: Job) -> None:
     capture, points = Capture.read(job.inputs["capture"]), Points.read(job.inputs["points"])
     unit, unit_from = scene_unit(capture, points.means)
     up, sure = up_of(points.cam_from_world)
-    notes = {"up_confidence": round(sure, 3), "unit_from": unit_from, "settings": settings.model_dump(mode="json")}
+    notes = {
+        "up_confidence": round(sure, 3),
+        "unit_from": unit_from,
+        "settings": settings.model_dump(mode="json"),
+    }
     try:
         cloud, notes["of"] = surface_in(capture, points, unit)
     except DataFailure as error:
@@ -36,7 +43,15 @@ def run(job: Job) -> None:
     origin = cloud.means.mean(0) if len(cloud.means) else np.zeros(3)
     if not np.isfinite(inputs.descriptors).all():
         bad = int(np.sum(~np.isfinite(inputs.descriptors).all(1)))
-        raise DataFailure(f"{bad} of {len(inputs.own)} points have descriptors that are not finite; report this")
+        raise DataFailure(
+            f"{bad} of {len(inputs.own)} points have descriptors that are not finite; report this"
+        )
     lost = truncation(cloud.means, cloud.covariances, up=up, unit=unit, describe=settings)
-    job.facts |= {"truncation": lost, "n_points": len(inputs.own), "unit": unit, "radii": RADII, "n_own": N_OWN} | notes
+    job.facts |= {
+        "truncation": lost,
+        "n_points": len(inputs.own),
+        "unit": unit,
+        "radii": RADII,
+        "n_own": N_OWN,
+    } | notes
     Descriptors(*inputs, origin.tolist(), up.tolist(), unit, notes).write(job.out)

@@ -28,7 +28,13 @@ from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import lacking
 from chebsplat.render import SceneRenderer
-from chebsplat.stages.measuring.image_quality import figures_as_taken, frame_split, image_figures, perceptual, timing
+from chebsplat.stages.measuring.image_quality import (
+    figures_as_taken,
+    frame_split,
+    image_figures,
+    perceptual,
+    timing,
+)
 from chebsplat.stages.runtime.command import Job
 from chebsplat.views import View
 
@@ -36,7 +42,8 @@ log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
-    """Colour and semantics of the exported scene on its protocol's views (docs/method.md, section 10).
+    """Colour and semantics of the exported scene on its protocol's views (docs/method.md, section
+    10).
 
     Reads `capture`, `scene` and, for the teacher's own figures, `features`. Writes `evaluation`.
     """
@@ -45,20 +52,31 @@ def run(job: Job) -> None:
     named = str(capture.protocol.get("name"))
     protocol = protocols.ALL.get(named)
     if protocol is None:
-        raise ConfigError(f"{job.inputs['capture']}: its protocol {named:.60} is unknown; ingest it again")
+        raise ConfigError(
+            f"{job.inputs['capture']}: its protocol {named:.60} is unknown; ingest it again"
+        )
     if capture.size != (scene.cameras.width, scene.cameras.height):
-        raise InputError(f"{job.inputs['scene']} has cameras of another size than the capture; pass those of one scene")
-    lpips = perceptual(Path(settings.lpips_weights).expanduser()) if settings.lpips_weights else None
+        raise InputError(
+            f"{job.inputs['scene']} has cameras of another size than the capture; "
+            "pass those of one scene"
+        )
+    lpips = (
+        perceptual(Path(settings.lpips_weights).expanduser()) if settings.lpips_weights else None
+    )
     row = {name: view for view, name in enumerate(capture.names)}
     chosen = capture.is_test if not protocol.ON_TRAINING else ~capture.is_test
     places = [k for k, name in enumerate(scene.cameras.names) if name in row and chosen[row[name]]]
     if capture.loss_mask is not None:
         counted = [k for k in places if capture.loss_mask[row[scene.cameras.names[k]]].any()]
         if hidden := len(places) - len(counted):
-            job.left_out(f"{hidden} of {len(places)} views", "masks and transparency leave no pixel of them")
+            job.left_out(
+                f"{hidden} of {len(places)} views", "masks and transparency leave no pixel of them"
+            )
         places = counted
     if not places:
-        raise DataFailure("no view to evaluate has a camera and a pixel that counts; lower ingest.test_every")
+        raise DataFailure(
+            "no view to evaluate has a camera and a pixel that counts; lower ingest.test_every"
+        )
     names = [scene.cameras.names[k] for k in places]
     renderer = SceneRenderer(scene.parameters, job.device, scene.cameras.Ks)
     cameras = [camera(scene, k) for k in places]
@@ -66,7 +84,9 @@ def run(job: Job) -> None:
     measured = capture.protocol | {"resolution": "x".join(map(str, capture.size))}
     figures: dict[str, Any] = {"names": names, "protocol": measured, "source": capture.source}
     shown: dict[str, list[np.ndarray]] = {"renders": []}
-    views = evaluated_views(job, renderer, dict(zip(names, cameras, strict=True)), capture, scene, shown)
+    views = evaluated_views(
+        job, renderer, dict(zip(names, cameras, strict=True)), capture, scene, shown
+    )
     segmentation = segmented(job, protocol, views, capture, scene, renderer)
     for _ in views:  # whatever the protocol did not look at
         pass
@@ -91,7 +111,10 @@ def run(job: Job) -> None:
     figures["left_out"] = scene.summary.get("left_out", {}) | job.facts.get("left_out", {})
     job.facts |= {"psnr": figures["image"]["psnr"], "n_test": len(names)}
     if segmentation:
-        job.facts |= {"miou": segmentation["scene"]["miou"], "miou_of": segmentation["counted"]["miou"]}
+        job.facts |= {
+            "miou": segmentation["scene"]["miou"],
+            "miou_of": segmentation["counted"]["miou"],
+        }
     Evaluation(figures, pictures).write(job.out)
 
 
@@ -103,7 +126,9 @@ def segmented(
     scene: Scene,
     renderer: SceneRenderer,
 ) -> dict[str, Any] | None:
-    """What the protocol says of the scene's labels, and what matches nothing; None of a scene without semantics."""
+    """What the protocol says of the scene's labels, and what matches nothing; None of a scene
+    without semantics.
+    """
     if scene.labels is None:
         job.left_out("segmentation", "the scene has no semantics")
         return None
@@ -115,7 +140,10 @@ def segmented(
         job.left_out("mIoU", too_little(found["counted"]["miou"]))
     elif "point_miou" in found["scene"] and found["scene"]["point_miou"] is None:
         rests = found["counted"]["point_miou"]
-        job.left_out("3D point mIoU", too_little(rests) if rests["classes"] else "the capture has no depth with poses")
+        job.left_out(
+            "3D point mIoU",
+            too_little(rests) if rests["classes"] else "the capture has no depth with poses",
+        )
     if protocol.TRUTH == "labels":
         found["unmatched"] = unmatched(scene.label_names or [], capture.class_names or [])
     return found
@@ -124,21 +152,31 @@ def segmented(
 def too_little(rests: dict[str, int]) -> str:
     """Why there is no mIoU of a truth of so many `classes`, of pixels or of points."""
     if not rests["classes"]:
-        return "no pixel of the evaluated views has a label; label some of them, or choose others (ingest.test_every)"
+        return (
+            "no pixel of the evaluated views has a label; label some of them, or choose others "
+            "(ingest.test_every)"
+        )
     return "what the evaluated views show is of one class alone: a mean over classes needs two"
 
 
 def unmatched(names: list[str], classes: list[str]) -> dict[str, list[str]]:
-    """The scene's labels that no class of the truth is called like, and the classes that no label is; said, too."""
+    """The scene's labels that no class of the truth is called like, and the classes that no label
+    is; said, too.
+    """
     found = {"scene": lacking(names, classes), "truth": lacking(classes, names)}
     if found["truth"]:
-        log.warning("no label of the scene is called like these classes of the truth: %s", few(found["truth"]))
+        log.warning(
+            "no label of the scene is called like these classes of the truth: %s",
+            few(found["truth"]),
+        )
     if found["scene"]:
         log.info("labels of the scene that the truth has no class for: %s", few(found["scene"]))
     return {side: some for side, some in found.items() if some}
 
 
-def timings(job: Job, renderer: SceneRenderer, cameras: list[View], semantic: bool) -> dict[str, Any]:
+def timings(
+    job: Job, renderer: SceneRenderer, cameras: list[View], semantic: bool
+) -> dict[str, Any]:
     """Frames a second, and on the CPU milliseconds of a frame by part."""
     repeats, split = job.config.evaluate.timing_repeats, {}
     if not repeats:
@@ -148,17 +186,22 @@ def timings(job: Job, renderer: SceneRenderer, cameras: list[View], semantic: bo
     if job.device == "cpu":
         split = frame_split(renderer, cameras, repeats)
     else:
-        job.left_out("milliseconds of a frame by part", "gsplat renders a frame on the GPU in one go")
+        job.left_out(
+            "milliseconds of a frame by part", "gsplat renders a frame on the GPU in one go"
+        )
     return {"frames_per_second": per_second, "milliseconds": split}
 
 
 def layouts(job: Job, scene: Scene, view: View, image: np.ndarray) -> dict[str, int]:
-    """How far the picture of a view u8 [H, W, 3], of the ragged arrays, is from that of each layout of PLY: grey
-    levels of 255, the largest difference. Sizes are in the figures, under the same names.
+    """How far the picture of a view u8 [H, W, 3], of the ragged arrays, is from that of each layout
+    of PLY: grey levels of 255, the largest difference. Sizes are in the figures, under the same
+      names.
     """
     path, world = job.inputs["scene"], World.read(scene.summary)
     manifest, found = read_manifest(path, Scene.SCHEMA), {"ragged": 0}
-    of_degrees = sorted(name for name in manifest.files if name.startswith("scene_d") and name.endswith(".ply"))
+    of_degrees = sorted(
+        name for name in manifest.files if name.startswith("scene_d") and name.endswith(".ply")
+    )
     for layout, names in (("ply", ["scene.ply"]), ("split", of_degrees)):
         if names:
             parts = [read_ply(checked(path, manifest, name), world)[0] for name in names]
@@ -203,10 +246,14 @@ def evaluated_views(
     scene: Scene,
     shown: dict[str, list[np.ndarray]],
 ) -> Iterator[EvaluatedView]:
-    """Render one view after another; `shown` collects the pictures. Everything is joined on the view's name."""
+    """Render one view after another; `shown` collects the pictures. Everything is joined on the
+    view's name.
+    """
 
     def as_classes(labels: np.ndarray) -> np.ndarray:
-        """A picture whose labels are numbered as the truth's, -1 where the truth has no such class."""
+        """A picture whose labels are numbered as the truth's, -1 where the truth has no such
+        class.
+        """
         if scene.label_names is None or capture.class_names is None:
             return labels
         return translated(labels, scene.label_names, capture.class_names, -1)
@@ -219,8 +266,14 @@ def evaluated_views(
     if "features" in job.inputs and scene.labels is not None:
         teacher = Features.read(job.inputs["features"])
         own = scene.label_embeddings
-        if teacher.label_names != scene.label_names or own is None or teacher.label_embeddings.shape != own.shape:
-            raise InputError(f"{job.inputs['features']} has other labels than the scene; export the scene again")
+        if (
+            teacher.label_names != scene.label_names
+            or own is None
+            or teacher.label_embeddings.shape != own.shape
+        ):
+            raise InputError(
+                f"{job.inputs['features']} has other labels than the scene; export the scene again"
+            )
         teachers = MapsByName(teacher.names, teacher.features, "features of a teacher")
         if teacher.pseudo_labels is not None:  # of its own channels
             pseudo_labels = MapsByName(teacher.names, teacher.pseudo_labels, "labels of a teacher")

@@ -19,15 +19,17 @@ from chebsplat.stages.runtime.command import Job
 def run(job: Job) -> None:
     """The trained Gaussians in order of SH degree, each with its label.
 
-    Reads `gaussians`, for names of labels `features` and, in place of trained features, `refined` or `lifted`. Writes
-    `scene`.
+    Reads `gaussians`, for names of labels `features` and, in place of trained features, `refined`
+    or `lifted`. Writes `scene`.
 
-    Choices: a Gaussian that no training view sees has lifted features of zero: no label, and no part in what a view of
-      the features shows.
+    Choices: a Gaussian that no training view sees has lifted features of zero: no label, and no
+      part in what a view of the features shows.
     """
     gaussians = Gaussians.read(job.inputs["gaussians"])
     if len(gaussians.parameters["means"]) == 0:
-        raise DataFailure("the checkpoint holds no Gaussians; train the scene again with milder pruning")
+        raise DataFailure(
+            "the checkpoint holds no Gaussians; train the scene again with milder pruning"
+        )
     order = np.argsort(gaussians.parameters["degrees"], kind="stable")
     wanted = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN", "degrees")
     parameters = {name: gaussians.parameters[name][order] for name in wanted}
@@ -43,7 +45,9 @@ def run(job: Job) -> None:
         teacher = Features.read(job.inputs["features"])
         parameters["features"] = semantic[order]
         if semantic.shape[1] != teacher.label_embeddings.shape[1]:
-            raise InputError(f"{job.inputs['features']} has other channels than the checkpoint; pass its own")
+            raise InputError(
+                f"{job.inputs['features']} has other channels than the checkpoint; pass its own"
+            )
         labels = decode_labels(parameters["features"], teacher.label_embeddings).astype(np.int32)
         labels[~parameters["features"].any(1)] = -1
         labelled = {
@@ -55,7 +59,11 @@ def run(job: Job) -> None:
     for degree in range(int(parameters["degrees"].max(initial=0)) + 1, 4):
         job.left_out(f"SH band {degree}", "no Gaussian keeps it")
     left_out = gaussians.notes.get("left_out", {}) | job.facts.get("left_out", {})
-    summary = {"left_out": left_out, "by_degree": counts, "n_initial": gaussians.notes.get("n_initial")}
+    summary = {
+        "left_out": left_out,
+        "by_degree": counts,
+        "n_initial": gaussians.notes.get("n_initial"),
+    }
     summary |= World.read(gaussians.notes).notes
     scene = Scene(parameters, gaussians.cameras, order, **labelled, summary=summary)
     sizes = scene.write(job.out)
@@ -63,12 +71,16 @@ def run(job: Job) -> None:
 
 
 def later_features(job: Job, n: int) -> np.ndarray | None:
-    """Features [n, C] made after training, refined before lifted; None where the trained ones are the scene's."""
+    """Features [n, C] made after training, refined before lifted; None where the trained ones are
+    the scene's.
+    """
     records: dict[str, type[Refined | Lifted]] = {"refined": Refined, "lifted": Lifted}
     role = next((role for role in records if role in job.inputs), None)
     if role is None:
         return None
     features: np.ndarray = records[role].read(job.inputs[role]).features
     if len(features) != n:
-        raise InputError(f"{job.inputs[role]} is of {len(features)} Gaussians, not these {n}; make it again")
+        raise InputError(
+            f"{job.inputs[role]} is of {len(features)} Gaussians, not these {n}; make it again"
+        )
     return features

@@ -1,4 +1,6 @@
-"""learn: what a scene teaches about shape, for the scenes after it: sums over its points (Eqs 14-15)."""
+"""learn: what a scene teaches about shape, for the scenes after it: sums over its points (Eqs
+14-15).
+"""
 
 from __future__ import annotations
 
@@ -39,17 +41,19 @@ from chebsplat.stages.teacher_models.text_encoder import found
 
 REACH = 0.3  # metres from a label to the described point that it is of
 KIND = {"depth": "held_out", "swept depth": "held_out_swept"}  # of rooms, by kind of surface
-KNOWN = 1.05  # times the largest novelty of such rooms, which were held out: what is newer is of another kind
+# times the largest novelty of such rooms, which were held out: what is newer is of another kind
+KNOWN = 1.05
 VOUCHED = ("labels", "given")  # kinds of teacher that the user answers for
 
 
 def run(job: Job) -> None:
     """The lesson of a scene, and the evidence by which later scenes trust it.
 
-    Reads `capture`, `points`, `descriptors`, `encoding`, `features`, and the `knowledge` that ships, beside whose
-    answers it is judged. Writes `lesson`. It is of nothing where a scene shows too little of a surface.
-    Choices: trust is measured beside what ships, not beside what the lessons before have made of it: so it is the same
-      in whatever order scenes are learned.
+    Reads `capture`, `points`, `descriptors`, `encoding`, `features`, and the `knowledge` that
+    ships, beside whose answers it is judged. Writes `lesson`. It is of nothing where a scene shows
+    too little of a surface.
+    Choices: trust is measured beside what ships, not beside what the lessons before have made of
+      it: so it is the same in whatever order scenes are learned.
     """
     settings, start = job.config.learn, read_knowledge(job.inputs["start"])
     capture = Capture.read(job.inputs["capture"])
@@ -87,12 +91,17 @@ def run(job: Job) -> None:
         return
     if notes["unnamed"]:
         job.left_out(
-            "labels without a word", f"knowledge has no word for {', '.join(notes['unnamed'])}: no vote from shape"
+            "labels without a word",
+            f"knowledge has no word for {', '.join(notes['unnamed'])}: no vote from shape",
         )
     sums = summed(z, np.concatenate([said, words], 1), weights)
     seen, half = n_views >= LEAST_VIEWS, said.shape[1]
     answers = z @ (start.map[:, :half] if in_channels else start.map[:, half:])
-    missed = weights @ np.square(answers - said).sum(1) / max(float(weights @ np.square(said).sum(1)), 1e-30)
+    missed = (
+        weights
+        @ np.square(answers - said).sum(1)
+        / max(float(weights @ np.square(said).sum(1)), 1e-30)
+    )
     rho, spread = novelty(sums, start.scale, start.basis), sums.spread()
     notes |= {
         "n_points": int(seen.sum()),
@@ -109,7 +118,12 @@ def run(job: Job) -> None:
 
 
 def meant(
-    job: Job, start: Knowledge, capture: Capture, points: Points, features: Features, descriptors: Descriptors
+    job: Job,
+    start: Knowledge,
+    capture: Capture,
+    points: Points,
+    features: Features,
+    descriptors: Descriptors,
 ) -> tuple[np.ndarray, np.ndarray]:
     """What training views mean by each described point, on average, f64 [N, d], and how
     many see it [N].
@@ -118,7 +132,9 @@ def meant(
     """
     row = {name: view for view, name in enumerate(capture.names)}
     place = {name: view for view, name in enumerate(features.names)}
-    used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]] and name in place]
+    used = [
+        k for k, name in enumerate(points.names) if not capture.is_test[row[name]] and name in place
+    ]
     if not used:
         raise DataFailure("no training view has a camera and features")
     Ks, within = points.Ks[used], SEEN_WITHIN
@@ -133,7 +149,14 @@ def meant(
     views = (meaning(place[points.names[k]]) for k in used)
     means, _ = in_scene(descriptors)
     return averaged(
-        means, depth, views, start.matrix.shape[1], Ks, points.cam_from_world[used], within, descriptors.unit
+        means,
+        depth,
+        views,
+        start.matrix.shape[1],
+        Ks,
+        points.cam_from_world[used],
+        within,
+        descriptors.unit,
     )
 
 
@@ -149,10 +172,11 @@ def named_embeddings(job: Job, start: Knowledge, features: Features) -> np.ndarr
 def labelled(
     path: Path, start: Knowledge, descriptors: Descriptors, world: World
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a user says of points: the words f32 [N, d] of the described points, zero of the others; n_views,
-    LEAST_VIEWS of those; and the unit embeddings f32 [L, d] of the words.
+    """What a user says of points: the words f32 [N, d] of the described points, zero of the others;
+    n_views, LEAST_VIEWS of those; and the unit embeddings f32 [L, d] of the words.
 
-    Raises: InputError naming the line that is no point, the word that knowledge lacks, or that nothing lies beside.
+    Raises: InputError naming the line that is no point, the word that knowledge lacks, or that
+      nothing lies beside.
     Choices: a label is of the described point nearest to it, within REACH.
     """
     where, words = read_labels(path)
@@ -160,19 +184,29 @@ def labelled(
     if -1 in rows:
         word = words[rows.index(-1)]
         near = ", ".join(suggest(word, start.words))
-        raise InputError(f"{path}: knowledge has no word {word}" + (f"; near: {near}" if near else ""))
+        raise InputError(
+            f"{path}: knowledge has no word {word}" + (f"; near: {near}" if near else "")
+        )
     means, _ = in_scene(descriptors)
     away, nearest = cKDTree(means).query(world.inward(where))
     beside = away <= REACH * descriptors.unit
     if not beside.any():
-        raise InputError(f"{path}: no point lies within {REACH} m of the scene's surface; give x, y, z in its frame")
-    said, embeddings = np.zeros((len(means), start.matrix.shape[1]), np.float32), units(start.embeddings[rows])
+        raise InputError(
+            f"{path}: no point lies within {REACH} m of the scene's surface; give x, "
+            "y, z in its frame"
+        )
+    said, embeddings = (
+        np.zeros((len(means), start.matrix.shape[1]), np.float32),
+        units(start.embeddings[rows]),
+    )
     np.add.at(said, nearest[beside], embeddings[beside])
     return units(said), np.where(said.any(1), LEAST_VIEWS, 0), np.unique(embeddings, axis=0)
 
 
 def read_labels(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Points f64 [M, 3] and a word each, of a CSV with columns x, y, z, word. Raises InputError naming the line."""
+    """Points f64 [M, 3] and a word each, of a CSV with columns x, y, z, word. Raises InputError
+    naming the line.
+    """
     where, words = [], []
     with path.open(newline="", encoding="utf-8") as handle:
         for number, row in enumerate(csv.DictReader(handle), start=2):
@@ -180,7 +214,11 @@ def read_labels(path: Path) -> tuple[np.ndarray, list[str]]:
                 where.append([float(row[axis]) for axis in "xyz"])
                 words.append(row["word"].strip())
             except (KeyError, TypeError, ValueError, AttributeError):
-                raise InputError(f"{path}, line {number}: x, y, z and a word are needed, under these names") from None
+                raise InputError(
+                    f"{path}, line {number}: x, y, z and a word are needed, under these names"
+                ) from None
     if not where or not np.isfinite(where).all():
-        raise InputError(f"{path} holds no points, or some that are not finite; give x, y, z and a word a line")
+        raise InputError(
+            f"{path} holds no points, or some that are not finite; give x, y, z and a word a line"
+        )
     return np.array(where), words

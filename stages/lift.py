@@ -1,4 +1,6 @@
-"""lift: what the 2D teacher says of each Gaussian of a trained scene, by one pass over the training views."""
+"""lift: what the 2D teacher says of each Gaussian of a trained scene, by one pass over the training
+views.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +14,24 @@ from chebsplat.stages.training.truth import labels_right
 
 
 def run(job: Job) -> None:
-    """Lift features to Gaussians, with their evidence, without training (docs/method.md, section 12).
+    """Lift features to Gaussians, with their evidence, without training (docs/method.md, section
+    12).
 
     Reads `capture`, `gaussians` and `features`. Writes `lifted`.
     """
-    capture, gaussians = Capture.read(job.inputs["capture"]), Gaussians.read(job.inputs["gaussians"])
+    capture, gaussians = (
+        Capture.read(job.inputs["capture"]),
+        Gaussians.read(job.inputs["gaussians"]),
+    )
     features = Features.read(job.inputs["features"])
-    lifted = lifted_from(capture, gaussians.cameras, gaussians.parameters, features, job.config.lift.gate, job.progress)
+    lifted = lifted_from(
+        capture,
+        gaussians.cameras,
+        gaussians.parameters,
+        features,
+        job.config.lift.gate,
+        job.progress,
+    )
     n = len(lifted.features)
     job.facts |= {
         "n_gaussians": n,

@@ -21,7 +21,8 @@ N_COMPARED = 2048  # points of the scene that both are asked of
 
 
 def run(job: Job) -> None:
-    """`encoder.onnx`, which holds the contract of its inputs and outputs (docs/method.md, section 14).
+    """`encoder.onnx`, which holds the contract of its inputs and outputs (docs/method.md, section
+    14).
 
     Reads `knowledge` and `descriptors`. Writes `encoder`.
     Raises: DataFailure where the graph answers otherwise than torch by more than TOLERANCE.
@@ -36,7 +37,9 @@ def run(job: Job) -> None:
     path = job.out / ENCODER
     onnx.save(model, path)
     try:
-        inputs = inputs_of(job.inputs["knowledge"], Descriptors.read(job.inputs["descriptors"]), knowledge)
+        inputs = inputs_of(
+            job.inputs["knowledge"], Descriptors.read(job.inputs["descriptors"]), knowledge
+        )
     except DataFailure as error:
         job.left_out("comparison with torch", str(error))
         return
@@ -46,11 +49,20 @@ def run(job: Job) -> None:
     answers = runner.run(None, {name: given[name].numpy() for name in wanted})[0]
     difference = float(np.abs(answers - answered(knowledge, inputs)).max())
     if not difference <= TOLERANCE:
-        raise DataFailure(f"{ENCODER} differs from torch by {difference:.1e}, more than {TOLERANCE:.1e}; report this")
-    job.facts |= {"largest_difference": difference, "n_compared": len(answers), "bytes": path.stat().st_size}
+        raise DataFailure(
+            f"{ENCODER} differs from torch by {difference:.1e}, more than "
+            f"{TOLERANCE:.1e}; report this"
+        )
+    job.facts |= {
+        "largest_difference": difference,
+        "n_compared": len(answers),
+        "bytes": path.stat().st_size,
+    }
 
 
 def first(inputs: PointInputs, count: int) -> PointInputs:
     """The first `count` points, and the neighbours that are among them."""
     own, means, normals, descriptors, neighbors = (values[:count] for values in inputs)
-    return PointInputs(own, means, normals, descriptors, np.where(neighbors < len(own), neighbors, -1))
+    return PointInputs(
+        own, means, normals, descriptors, np.where(neighbors < len(own), neighbors, -1)
+    )

@@ -23,7 +23,8 @@ def run(job: Job) -> None:
     Reads photos or a video. Writes `model`.
 
     Raises:  DataFailure where few photos register, or nothing tells how far away anything is.
-    Choices: all photos take part, those that are tested later, too. A video gives more frames where few of them join.
+    Choices: all photos take part, those that are tested later, too. A video gives more frames where
+      few of them join.
     """
     try:
         best = _best(job)
@@ -54,7 +55,9 @@ def _best(job: Job) -> PhotoModel:
         if best is not None and share(best) * posing.MORE >= 1:
             break
     if best is None:
-        raise DataFailure(f"no two photos of {folder} could be registered; {judge.REMEDY}, of more texture")
+        raise DataFailure(
+            f"no two photos of {folder} could be registered; {judge.REMEDY}, of more texture"
+        )
     judge.check(best, settings.min_registered)
     return best
 

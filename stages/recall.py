@@ -1,4 +1,6 @@
-"""recall: what a scene starts from: the encoder that ships, and the map that it and the lessons of others give."""
+"""recall: what a scene starts from: the encoder that ships, and the map that it and the lessons of
+others give.
+"""
 
 from __future__ import annotations
 
@@ -16,39 +18,54 @@ from chebsplat.shape.lessons import Sums, basis, combined, mapped, mean_of, unex
 from chebsplat.stages.registry import LESSON
 from chebsplat.stages.runtime.command import Job
 
-ALIKE = 0.5, 0.75  # share of labels that shape and teacher have alike: below it no trust, above it all
-GIVEN = 0.1, 0.2  # the same of labels that were given: what is as good as drawn at random is no label of this room
+# share of labels that shape and teacher have alike: below it no trust, above it all
+ALIKE = 0.5, 0.75
+# the same of labels that were given: what is as good as drawn at random is no label of this room
+GIVEN = 0.1, 0.2
 FAMILIAR = 0.4  # the same of how sure the teacher is beside shape (`blend.familiar`), from 0 up
 
 
 def run(job: Job) -> None:
-    """The map of the lessons that a scene is pinned to, each by its trust (docs/method.md, section 14).
+    """The map of the lessons that a scene is pinned to, each by its trust (docs/method.md, section
+    14).
 
     Reads the `knowledge` that ships, and of each such scene its `lesson`. Writes `knowledge`.
     """
     start = read_knowledge(job.inputs["start"])
-    paths = {role.removeprefix(LESSON): path for role, path in job.inputs.items() if role.startswith(LESSON)}
+    paths = {
+        role.removeprefix(LESSON): path
+        for role, path in job.inputs.items()
+        if role.startswith(LESSON)
+    }
     lessons = {key: read_lesson(path) for key, path in sorted(paths.items())}
     for key, lesson in lessons.items():
         if lesson.sums[0].shape != (len(start.map),) * 2:
             raise InputError(
-                f"{paths[key]} is a lesson of another encoder; learn it again (`chebsplat knowledge rebuild`)"
+                f"{paths[key]} is a lesson of another encoder; learn it again (`chebsplat "
+                "knowledge rebuild`)"
             )
     knowledge = taught(start, lessons)
     known = mean_of([Sums(*of) for of in (*start.shipped, *(one.sums for one in lessons.values()))])
     job.facts["unexplained"] = unexplained(known, knowledge.map.astype(np.float64))
-    job.facts |= knowledge.lessons | {"n_lessons": len(lessons), "encoder": read_manifest(job.inputs["start"]).key}
+    job.facts |= knowledge.lessons | {
+        "n_lessons": len(lessons),
+        "encoder": read_manifest(job.inputs["start"]).key,
+    }
     write_knowledge(job.out, knowledge)
 
 
 def taught(start: Knowledge, lessons: Mapping[str, Lesson]) -> Knowledge:
     """What ships, and what lessons add, taken in the order of their keys.
 
-    Choices: the basis grows by lessons that are trusted, and newer in kind than what ships calls known.
+    Choices: the basis grows by lessons that are trusted, and newer in kind than what ships calls
+      known.
     """
     shipped = [Sums(*of) for of in start.shipped]
     used = {key: of for key, of in sorted(lessons.items()) if "none" not in of.notes}
-    sums, trust = [Sums(*of.sums) for of in used.values()], [trusted(of.notes) for of in used.values()]
+    sums, trust = (
+        [Sums(*of.sums) for of in used.values()],
+        [trusted(of.notes) for of in used.values()],
+    )
     new = [of.notes["novelty"] > of.notes["known"] for of in used.values()]
     growing = [k for k, weight in enumerate(trust) if new[k] and weight > 0]
     known = combined(
@@ -62,7 +79,13 @@ def taught(start: Knowledge, lessons: Mapping[str, Lesson]) -> Knowledge:
         shipped=[],
         lessons={
             "of": [
-                {"key": key, "scene": of.notes["scene"], "trust": weight, "why": why(of.notes), "new": novel}
+                {
+                    "key": key,
+                    "scene": of.notes["scene"],
+                    "trust": weight,
+                    "why": why(of.notes),
+                    "new": novel,
+                }
                 for (key, of), weight, novel in zip(used.items(), trust, new, strict=True)
             ]
         },
@@ -72,9 +95,11 @@ def taught(start: Knowledge, lessons: Mapping[str, Lesson]) -> Knowledge:
 def trusted(notes: Mapping[str, Any]) -> float:
     """How far a lesson is trusted, in [0, 1].
 
-    Choices: by the labels that shape and teacher have alike, and by how sure the teacher is beside shape: a
-      teacher out of its depth says the same wrong things from every view, which no agreement of views
-      tells. Fully where the user answers for the labels, unless shape has next to none of them alike.
+    Choices: by the labels that shape and teacher have alike, and by how sure the teacher is beside
+      shape: a teacher out of its depth says the same wrong things from every view, which no
+        agreement of views
+      tells. Fully where the user answers for the labels, unless shape has next to none of them
+      alike.
     """
     least, enough = GIVEN if notes["given"] else ALIKE
     alike = float(np.clip((notes["alike"] - least) / (enough - least), 0, 1))
@@ -85,4 +110,7 @@ def why(notes: Mapping[str, Any]) -> str:
     """What a lesson's trust comes from, in words."""
     if notes["given"]:
         return f"its labels were given, and shape has {notes['alike']:.0%} of them alike"
-    return f"shape has {notes['alike']:.0%} of its labels alike, and is {notes['familiar']:.2f} as sure"
+    return (
+        f"shape has {notes['alike']:.0%} of its labels alike, and is {notes['familiar']:.2f} "
+        "as sure"
+    )

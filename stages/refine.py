@@ -1,4 +1,6 @@
-"""refine: the features of a finished scene, smoothed, and blended with knowledge as far as its training views ask."""
+"""refine: the features of a finished scene, smoothed, and blended with knowledge as far as its
+training views ask.
+"""
 
 from __future__ import annotations
 
@@ -38,29 +40,37 @@ REACH = 0.15  # metres from swept points, where an answer is half as long
 
 
 def run(job: Job) -> None:
-    """Smooth the features of trained Gaussians, then blend them with knowledge (docs/method.md, section 13).
+    """Smooth the features of trained Gaussians, then blend them with knowledge (docs/method.md,
+    section 13).
 
-    Reads `gaussians` and `lifted`, for the scene's unit `capture`, for what knowledge says `knowledge`, `descriptors`,
-    `encoding` and `features`, by which the share of labels that change is counted, too. Writes `refined`.
+    Reads `gaussians` and `lifted`, for the scene's unit `capture`, for what knowledge says
+    `knowledge`, `descriptors`, `encoding` and `features`, by which the share of labels that change
+    is counted, too. Writes `refined`.
     """
     settings = job.config.refine
     gaussians, lifted = Gaussians.read(job.inputs["gaussians"]), Lifted.read(job.inputs["lifted"])
     p = gaussians.parameters
     if len(p["means"]) == 0:
-        raise DataFailure("the checkpoint holds no Gaussians; train the scene again with milder pruning")
+        raise DataFailure(
+            "the checkpoint holds no Gaussians; train the scene again with milder pruning"
+        )
     if len(lifted.features) != len(p["means"]):
         raise InputError(
-            f"{job.inputs['lifted']} is of {len(lifted.features)} Gaussians, not {len(p['means'])}; lift again"
+            f"{job.inputs['lifted']} is of {len(lifted.features)} Gaussians, not "
+            f"{len(p['means'])}; lift again"
         )
     trained = p.get("features")
     capture = Capture.read(job.inputs["capture"]) if "capture" in job.inputs else None
     started = settings.start
-    if started == "auto":  # Gaussians that no depth has placed lie where they look right, which lifting asks nothing of
+    # Gaussians that no depth has placed lie where they look right, which lifting asks nothing of
+    if started == "auto":
         started = "both" if capture is None or capture.depth is not None else "trained"
     if trained is None:
         started = "lifted"
         if settings.start != started:
-            job.left_out("trained features", "the scene was trained without; the lifted ones are refined")
+            job.left_out(
+                "trained features", "the scene was trained without; the lifted ones are refined"
+            )
     features = start(started, lifted.features, trained)
     unit, job.facts["unit_from"] = scene_unit(capture, p["means"])
     near = affinities(p["means"], *surface_of(p), unit)
@@ -76,19 +86,31 @@ def run(job: Job) -> None:
         known_to_teacher = familiar(lifted.features, knowledge, embeddings)
         belief = believed(lifted.features, lifted.n_views, knowledge, embeddings, known_to_teacher)
         strength *= belief
-        evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views) * known_to_teacher
+        evidence = (
+            effective(lifted.n_views)
+            * reliable(lifted.halves, lifted.half_views)
+            * known_to_teacher
+        )
         blended = blend(made[1], evidence, knowledge, strength)
-        made[2] = smooth(blended, evidence + trusted(knowledge, strength), near) if smoothed else blended
-    curve = {name: {f"{k:g}": value for k, value in row.items()} for name, row in choice.curve.items()}
+        made[2] = (
+            smooth(blended, evidence + trusted(knowledge, strength), near) if smoothed else blended
+        )
+    curve = {
+        name: {f"{k:g}": value for k, value in row.items()} for name, row in choice.curve.items()
+    }
     notes = {"start": started, "smooth": smoothed, "strength": strength, "curve": curve}
     notes |= {"familiar": known_to_teacher, "believed": belief}
-    sure = confidence(made[1], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher)
+    sure = confidence(
+        made[1], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher
+    )
     Refined(made[2], sure, notes).write(job.out)
     of_strength = choice.curve["on" if smoothed else "off"]
     agree = float(np.interp(strength, list(of_strength), list(of_strength.values())))
     job.facts |= {"halves_agree": agree, "gain": agree - choice.curve["off"][0.0]}
     if capture is not None and "features" in job.inputs:
-        job.facts["right"] = labels_right(capture, p, made[2], Features.read(job.inputs["features"]))
+        job.facts["right"] = labels_right(
+            capture, p, made[2], Features.read(job.inputs["features"])
+        )
     job.facts |= {"n_gaussians": len(features), "unit": unit, **notes} | shares(job, made)
 
 
@@ -98,21 +120,30 @@ def known(job: Job, parameters: dict[str, np.ndarray], unit: float) -> np.ndarra
 
     Args: parameters: of the Gaussians; unit: scene units in a metre.
     Raises: ConfigError where an input that knowledge needs is missing.
-    Choices: where a sweep found the points, an answer's length, by which it counts, falls with the distance to them:
-      what no photo's depth shows is the views' to tell.
+    Choices: where a sweep found the points, an answer's length, by which it counts, falls with the
+      distance to them: what no photo's depth shows is the views' to tell.
     """
     if "knowledge" not in job.inputs:
         return None
-    if absent := [role for role in ("descriptors", "encoding", "features") if role not in job.inputs]:
-        raise ConfigError(f"knowledge is of described points and a teacher; pass --in-{absent[0]}, too")
-    descriptors, encoding = Descriptors.read(job.inputs["descriptors"]), Encoding.read(job.inputs["encoding"])
+    if absent := [
+        role for role in ("descriptors", "encoding", "features") if role not in job.inputs
+    ]:
+        raise ConfigError(
+            f"knowledge is of described points and a teacher; pass --in-{absent[0]}, too"
+        )
+    descriptors, encoding = (
+        Descriptors.read(job.inputs["descriptors"]),
+        Encoding.read(job.inputs["encoding"]),
+    )
     if not len(encoding.features):
         job.left_out("knowledge of shape", encoding.notes["none"])
         return None
     path, features = job.inputs["knowledge"], Features.read(job.inputs["features"])
     knowledge = read_knowledge(path)
     if missing := unnamed(knowledge, features):
-        job.left_out("votes of shape on some labels", f"knowledge has no word for {', '.join(missing)}")
+        job.left_out(
+            "votes of shape on some labels", f"knowledge has no word for {', '.join(missing)}"
+        )
     try:
         translated = into_channels(path, knowledge, features)
     except DataFailure as error:
@@ -120,10 +151,16 @@ def known(job: Job, parameters: dict[str, np.ndarray], unit: float) -> np.ndarra
         return None
     means, normals = in_scene(descriptors)
     answers = translated(encoding.features.astype(np.float32) @ knowledge.map)
-    carried, away = carry(answers, means, normals, parameters["means"], surface_of(parameters)[0], unit)
+    carried, away = carry(
+        answers, means, normals, parameters["means"], surface_of(parameters)[0], unit
+    )
     if descriptors.notes["of"] == "swept depth":
         carried *= 1 / (1 + (away[:, None] / unit / REACH) ** 2)
-    job.facts["knowledge"] = {"of": descriptors.notes["of"], "n_points": len(means), "lessons": knowledge.lessons}
+    job.facts["knowledge"] = {
+        "of": descriptors.notes["of"],
+        "n_points": len(means),
+        "lessons": knowledge.lessons,
+    }
     return carried
 
 
@@ -133,7 +170,11 @@ def shares(job: Job, made: list[np.ndarray]) -> dict[str, Any]:
         return {}
     embeddings = Features.read(job.inputs["features"]).label_embeddings
     if embeddings.shape[1] != made[0].shape[1]:
-        raise InputError(f"{job.inputs['features']} has other channels than the checkpoint; pass its own")
+        raise InputError(
+            f"{job.inputs['features']} has other channels than the checkpoint; pass its own"
+        )
     labels = [decode_labels(features, embeddings) for features in made]
     names = ("changed_by_smoothing", "changed_by_knowledge")
-    return {name: float((a != b).mean()) for name, a, b in zip(names, labels, labels[1:], strict=False)}
+    return {
+        name: float((a != b).mean()) for name, a, b in zip(names, labels, labels[1:], strict=False)
+    }

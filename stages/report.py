@@ -1,4 +1,6 @@
-"""report: one self-contained HTML page with pictures, tables and error against run time, and the figures as CSV."""
+"""report: one self-contained HTML page with pictures, tables and error against run time, and the
+figures as CSV.
+"""
 
 from __future__ import annotations
 
@@ -52,25 +54,31 @@ BYTES = {
     "ragged": "ragged arrays",
     "semantic": "semantic arrays, beside either",
 }
-SMALLER = ("split", "ragged")  # layouts of what plain 3DGS holds, without the bands that were pruned
+# layouts of what plain 3DGS holds, without the bands that were pruned
+SMALLER = ("split", "ragged")
 FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 
 
 def run(job: Job) -> None:
     """One HTML page, and the figures as CSV, of what was measured and where it comes from.
 
-    Reads `evaluation` and `gaussians`, and of `model`, `capture`, `points`, `channels`, `features`, `agreement`,
-    `descriptors`, `encoding`, `lesson`, `knowledge`, `encoder`, `lifted`, `refined` and `scene` what there is. Writes
-    `report`.
+    Reads `evaluation` and `gaussians`, and of `model`, `capture`, `points`, `channels`, `features`,
+    `agreement`, `descriptors`, `encoding`, `lesson`, `knowledge`, `encoder`, `lifted`, `refined`
+    and `scene` what there is. Writes `report`.
     """
     evaluation = Evaluation.read(job.inputs["evaluation"])
     gaussians = Gaussians.read(job.inputs["gaussians"])
     if not gaussians.trace:
-        raise DataFailure("the training left no trace of error against run time; train the scene again")
+        raise DataFailure(
+            "the training left no trace of error against run time; train the scene again"
+        )
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
     if "knowledge" in manifests and manifests["knowledge"].stage != STAGE_OF["knowledge"]:
         del manifests["knowledge"]  # it ships, or was given: no stage of this scene has made it
-    facts, figures = {role: manifest.facts for role, manifest in manifests.items()}, evaluation.figures
+    facts, figures = (
+        {role: manifest.facts for role, manifest in manifests.items()},
+        evaluation.figures,
+    )
     left_out = absent_stages(job, gaussians) | figures["left_out"]
     for of_input in facts.values():
         left_out |= of_input.get("left_out", {})
@@ -83,12 +91,20 @@ def run(job: Job) -> None:
         versions |= manifest.versions
         settings |= manifest.config
     by_degree = facts["scene"]["by_degree"] if "scene" in facts else None
-    rows = summary_rows(figures, by_degree, facts["gaussians"], timed) + refined_rows(facts.get("refined"))
+    rows = summary_rows(figures, by_degree, facts["gaussians"], timed) + refined_rows(
+        facts.get("refined")
+    )
     rows += agreement_rows(facts.get("agreement")) + clock_rows(manifests["gaussians"])
     write_table(job.out / "figures.csv", rows)
-    write_table(job.out / "trace.csv", [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)])
+    write_table(
+        job.out / "trace.csv",
+        [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)],
+    )
     names = parts.label_names(job.inputs, figures)
-    colors = {name: "#" + bytes(color).hex() for name, color in zip(names, draw.palette(len(names)), strict=True)}
+    colors = {
+        name: "#" + bytes(color).hex()
+        for name, color in zip(names, draw.palette(len(names)), strict=True)
+    }
     pictures, pixels = parts.picture_rows(evaluation, names, N_PICTURES, job.out)
     text = rendered(
         REPORT,
@@ -127,7 +143,9 @@ def run(job: Job) -> None:
 
 
 def psnr_of_one_color(evaluation: Evaluation) -> float:
-    """PSNR, dB, of some evaluated photos, if each pixel had their mean colour: what a scene shows before training."""
+    """PSNR, dB, of some evaluated photos, if each pixel had their mean colour: what a scene shows
+    before training.
+    """
     truth = evaluation.pictures["truth"]
     photos = np.stack([truth[k] for k in range(0, len(truth), -(-len(truth) // N_PICTURES))])
     flat = np.broadcast_to(photos.mean((0, 1, 2)).round().astype(np.uint8), photos.shape)
@@ -135,16 +153,23 @@ def psnr_of_one_color(evaluation: Evaluation) -> float:
 
 
 def clock_rows(training: Manifest) -> list[list[str]]:
-    """(figure, scene, teacher) of a training that the clock limits: how far it came depends on the machine."""
+    """(figure, scene, teacher) of a training that the clock limits: how far it came depends on the
+    machine.
+    """
     seconds = training.config.get("train", {}).get("seconds")
     if seconds is None:
         return []
-    what = f"steps within {seconds:g} s by the clock (train.seconds, measured on {measured_on(training)})"
+    what = (
+        f"steps within {seconds:g} s by the clock (train.seconds, measured on "
+        f"{measured_on(training)})"
+    )
     return [[what, f"{training.facts['steps']:,}", ""]]
 
 
 def posed(model: PhotoModel) -> dict[str, Any]:
-    """Where photos that came alone were taken, in a sentence and a picture, and what is doubtful about it."""
+    """Where photos that came alone were taken, in a sentence and a picture, and what is doubtful
+    about it.
+    """
     point, view = model.tracks.T
     counts = np.bincount(view, minlength=len(model.names))
     errors = np.bincount(view, model.errors[point], len(model.names)) / np.maximum(counts, 1)
@@ -156,7 +181,10 @@ def posed(model: PhotoModel) -> dict[str, Any]:
 def decided_rows(facts: dict[str, Any]) -> list[tuple[str, str, str]]:
     """Settings that the training's config left open: name, value, and what decided it."""
     words = {name: of["value"] for name, of in facts.get("decided", {}).items()}
-    shown = {name: f"{value:.3g}" if isinstance(value, float) else str(value) for name, value in words.items()}
+    shown = {
+        name: f"{value:.3g}" if isinstance(value, float) else str(value)
+        for name, value in words.items()
+    }
     return [(f"train.{name}", value, facts["decided"][name]["by"]) for name, value in shown.items()]
 
 
@@ -164,9 +192,13 @@ def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:
     """(name, in a few words what it is) of the 2D teacher."""
     convention = facts["convention"]
     if facts["kind"] == "labels":
-        return "noisy labels", f"the source's own with {convention['confusion']:.0%} of the segments confused"
+        return "noisy labels", (
+            f"the source's own with {convention['confusion']:.0%} of the segments confused"
+        )
     if facts["kind"] == "given":
-        return "pseudo labels", f"the source's own with a confidence by pixel, {facts['n_labels']} labels"
+        return "pseudo labels", (
+            f"the source's own with a confidence by pixel, {facts['n_labels']} labels"
+        )
     scales = "one scale" if convention["n_scales"] == 1 else f"{convention['n_scales']} scales"
     views = f"{scales}{' and flips' if convention['flips'] else ''}"
     gives = convention.get("scores") or convention["output"]
@@ -176,22 +208,30 @@ def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:
 def absent_stages(job: Job, gaussians: Gaussians) -> dict[str, str]:
     """Stages of which this scene has no artifact, and why."""
     reasons = {
-        "features": "rendering only: the scene has no semantics" if "features" not in gaussians.parameters else "",
+        "features": "rendering only: the scene has no semantics"
+        if "features" not in gaussians.parameters
+        else "",
         "agreement": "the scene has no teacher, or its agreement was not measured",
         "lifted": "the scene has no teacher, or its features were not lifted",
         "refined": "the scene has no teacher, or its features were not refined",
     }
     absent = {role: why for role, why in reasons.items() if role not in job.inputs}
-    return {f"stage {STAGE_OF[role]}": why or "its artifact was not given" for role, why in absent.items()}
+    return {
+        f"stage {STAGE_OF[role]}": why or "its artifact was not given"
+        for role, why in absent.items()
+    }
 
 
 def summary_rows(
-    figures: dict[str, Any], by_degree: list[int] | None, trained: dict[str, Any], timed: dict[str, str]
+    figures: dict[str, Any],
+    by_degree: list[int] | None,
+    trained: dict[str, Any],
+    timed: dict[str, str],
 ) -> list[list[str]]:
     """Header, then (figure, scene, teacher). What was not measured says so.
 
-    Args: by_degree: Gaussians by SH degree, None where unknown; trained: facts of the training; timed: the machines
-      that `evaluation` and training (`gaussians`) were measured on.
+    Args: by_degree: Gaussians by SH degree, None where unknown; trained: facts of the training;
+      timed: the machines that `evaluation` and training (`gaussians`) were measured on.
     """
 
     def shown(value: float | None, form: str) -> str:
@@ -208,30 +248,48 @@ def summary_rows(
         ["LPIPS (vgg, images in [0, 1])", shown(figures["lpips"], "{:.3f}"), ""],
     ]
     segmentation = figures.get("segmentation") or {}
-    names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary band",
+    names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary "
+                                                                          "band",
              "rarest_miou": "mIoU of the five rarest classes", "point_miou": "mIoU of 3D points"}  # fmt: skip
     for key, name in names.items():
         if key in segmentation.get("scene", {}):
             teacher = segmentation.get("teacher")
             values = [segmentation["scene"][key], teacher[key] if teacher else None]
             of_truth = f" ({words})" if (words := rests(segmentation, key)) else ""
-            rows.append([name + of_truth, shown(values[0], "{:.1%}"), shown(values[1], "{:.1%}") if teacher else ""])
+            rows.append(
+                [
+                    name + of_truth,
+                    shown(values[0], "{:.1%}"),
+                    shown(values[1], "{:.1%}") if teacher else "",
+                ]
+            )
     rows.append(["Gaussians", f"{figures['n_gaussians']:,}", ""])
     if by_degree is not None:
-        rows.append(["Gaussians of SH degree 0, 1, 2, 3", " / ".join(f"{n:,}" for n in by_degree), ""])
+        rows.append(
+            ["Gaussians of SH degree 0, 1, 2, 3", " / ".join(f"{n:,}" for n in by_degree), ""]
+        )
     whole = figures["bytes"]["unpruned_ply"]
     for name, size in figures["bytes"].items():
         share = f" ({size / whole:.0%} of plain 3DGS)" if name in SMALLER else ""
         rows.append([f"bytes, {BYTES[name]}", f"{size:,}{share}", ""])
     on = f"measured on {timed['evaluation']}"
-    rows += [[f"frames/s, {FRAMES[name]} ({on})", f"{v:.1f}", ""] for name, v in figures["frames_per_second"].items()]
+    rows += [
+        [f"frames/s, {FRAMES[name]} ({on})", f"{v:.1f}", ""]
+        for name, v in figures["frames_per_second"].items()
+    ]
     if split := figures["milliseconds"]:
         threads = "one thread" if split["threads"] == 1 else f"{split['threads']} threads"
         under = f"{split['width']}x{split['height']}, {threads}, {split['device']}, {on}"
         parts = {"projection": "projection", "sh": "SH", "sort": "sort", "blend": "blend"}
-        rows += [[f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""] for part, name in parts.items()]
+        rows += [
+            [f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""]
+            for part, name in parts.items()
+        ]
     on = f"measured on {timed['gaussians']}"
-    rows += [[f"ms a training step, {part} ({on})", f"{v:.2f}", ""] for part, v in trained["milliseconds"].items()]
+    rows += [
+        [f"ms a training step, {part} ({on})", f"{v:.2f}", ""]
+        for part, v in trained["milliseconds"].items()
+    ]
     if peak := trained.get("peak_device_bytes"):
         rows.append(["bytes of the GPU's memory in training, at most", f"{peak:,}", ""])
     return rows
@@ -249,11 +307,16 @@ def taken_rows(taken: dict[str, Any] | None) -> list[list[str]]:
 
 
 def refined_rows(facts: dict[str, Any] | None) -> list[list[str]]:
-    """(figure, scene, teacher) of how the features were refined: what was chosen, and the agreements it rests on."""
+    """(figure, scene, teacher) of how the features were refined: what was chosen, and the
+    agreements it rests on.
+    """
     if facts is None:
         return []
     changed = {name: facts.get(f"changed_by_{name}") for name in ("smoothing", "knowledge")}
-    words = {name: "" if share is None else f", {share:.1%} of the labels changed" for name, share in changed.items()}
+    words = {
+        name: "" if share is None else f", {share:.1%} of the labels changed"
+        for name, share in changed.items()
+    }
     counts = f"counts as {facts['strength']:g} views" if facts["strength"] else "none"
     if (familiar := facts.get("familiar", 1.0)) < 1:
         counts += f"; the teacher is unsure of this scene, its views count for {familiar:.2f}"
@@ -263,7 +326,8 @@ def refined_rows(facts: dict[str, Any] | None) -> list[list[str]]:
     ]
     for name, curve in facts["curve"].items():
         shown = " / ".join(f"{value:.4f}" for value in curve.values())
-        rows.append([f"agreement of half the training views with the other, smoothing {name}, at k = "
+        rows.append([f"agreement of half the training views with the other, smoothing {name}, at "
+                     "k = "
                      + " / ".join(curve), shown, ""])  # fmt: skip
     return rows
 
@@ -274,7 +338,9 @@ def agreement_rows(facts: dict[str, Any] | None) -> list[list[str]]:
         return []
     value, count = facts["agreement"], facts["n_points"]
     shown = "not measured" if value is None else f"{value:.2f}"
-    return [[f"agreement of views on labels of {count:,} points (1: always, 0: by chance)", "", shown]]
+    return [
+        [f"agreement of views on labels of {count:,} points (1: always, 0: by chance)", "", shown]
+    ]
 
 
 def write_table(path: Path, rows: list[list[Any]]) -> None:

@@ -22,7 +22,8 @@ from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.settings import SfmSection
 
 log = logging.getLogger("chebsplat")
-Cloud = dict[str, Any]  # the fields of `Points` but the local shape, and seen_from [N]: the view that a point is from
+# the fields of `Points` but the local shape, and seen_from [N]: the view that a point is from
+Cloud = dict[str, Any]
 N_NEIGHBORS = 16  # that give a point its normal and covariance
 CANDIDATES = 16  # pixels with depth that are looked at, for each point that is wanted
 TRIED = 2000  # points that are held against depth
@@ -30,22 +31,27 @@ EVEN = 0.55  # of the points wanted: there whatever the colours are, for shape i
 
 
 def run(job: Job) -> None:
-    """Cameras, and points with the covariance and normal of their neighbours (docs/method.md, section 1).
+    """Cameras, and points with the covariance and normal of their neighbours (docs/method.md,
+    section 1).
 
-    Reads `capture`. Writes `points`. Poses, points and depth that the capture holds are taken; what it lacks is
-    computed by feature matching and triangulation, as is everything where `sfm.matching` names a way to match.
+    Reads `capture`. Writes `points`. Poses, points and depth that the capture holds are taken; what
+    it lacks is computed by feature matching and triangulation, as is everything where
+    `sfm.matching` names a way to match.
     """
     settings, capture = job.config.sfm, Capture.read(job.inputs["capture"])
     spares = capture.points is not None or capture.depth is not None
     given = capture.cam_from_world is not None and settings.matching == "auto" and spares
-    adjusted = wants_adjustment(job, capture, settings) if given else None  # otherwise all matches tell
+    # otherwise all matches tell
+    adjusted = wants_adjustment(job, capture, settings) if given else None
     given = given and not adjusted
     if given and capture.points is not None:
         job.left_out("feature matching", "poses are given, and points by the source")
         cloud = from_source(capture, settings)
     elif given:
         job.left_out("feature matching", "poses and depth are given: points come from depth")
-        _, cloud = reduced(from_depth(job, capture, settings), settings.max_points, settings.spacing)
+        _, cloud = reduced(
+            from_depth(job, capture, settings), settings.max_points, settings.spacing
+        )
     else:
         cloud = reconstruct(job, capture, settings, adjusted)
         if "poses_kept" in cloud["notes"] and capture.depth is not None:
@@ -57,11 +63,15 @@ def run(job: Job) -> None:
         depths = more.pop("depths")
         cloud = filled(cloud, more, min(MOST, settings.max_points), name="n_swept")
     if (n := len(cloud["means"])) < 16:
-        raise DataFailure(f"only {n} points were found, at least 16 are needed; add views with more overlap")
+        raise DataFailure(
+            f"only {n} points were found, at least 16 are needed; add views with more overlap"
+        )
     off = {} if "reprojection_error_px" in cloud["notes"] else missed(capture, cloud)
     if depths is not None:
         behind = backdrop(capture, cloud)
-        cloud = joined(cloud, behind) | {"notes": cloud["notes"] | {"n_behind": len(behind["means"])}}
+        cloud = joined(cloud, behind) | {
+            "notes": cloud["notes"] | {"n_behind": len(behind["means"])}
+        }
     means = cloud["means"]
     covariances, normals = local_shape(means, N_NEIGHBORS)
     eye = centers(cloud["cam_from_world"])[cloud["seen_from"]]
@@ -83,15 +93,20 @@ def run(job: Job) -> None:
 
 
 def missed(capture: Capture, cloud: Cloud) -> dict[str, float]:
-    """How far points that no matches have shown lie off the depth of training views, `depth_error`, a share of it, the
-    median; without depth, which share of the photos' cells holds a point, `covered`.
+    """How far points that no matches have shown lie off the depth of training views, `depth_error`,
+    a share of it, the median; without depth, which share of the photos' cells holds a point,
+    `covered`.
 
     Choices: TRIED points, by 8 views; what differs by more than a tenth lies behind something else.
     """
     if capture.depth is None:
-        return {"covered": covered(cloud["Ks"], cloud["cam_from_world"], cloud["means"], capture.size)}
+        return {
+            "covered": covered(cloud["Ks"], cloud["cam_from_world"], cloud["means"], capture.size)
+        }
     row = {name: k for k, name in enumerate(capture.names)}
-    views = [(k, row[name]) for k, name in enumerate(cloud["names"]) if not capture.is_test[row[name]]]
+    views = [
+        (k, row[name]) for k, name in enumerate(cloud["names"]) if not capture.is_test[row[name]]
+    ]
     means, errors = cloud["means"][:: -(-len(cloud["means"]) // TRIED)], [np.zeros(0)]
     for place, view in views[:: -(-len(views) // 8)]:
         image = project(means, cloud["Ks"][place], cloud["cam_from_world"][place], capture.size)
@@ -103,12 +118,15 @@ def missed(capture: Capture, cloud: Cloud) -> dict[str, float]:
     return {"depth_error": float(np.median(found))} if len(found) else {}
 
 
-def filled(cloud: Cloud, more: Cloud, count: int, spacing: str = "even", name: str = "n_from_depth") -> Cloud:
-    """A cloud with the points of another one of the same views between its own, at most `count`, one a cube.
+def filled(
+    cloud: Cloud, more: Cloud, count: int, spacing: str = "even", name: str = "n_from_depth"
+) -> Cloud:
+    """A cloud with the points of another one of the same views between its own, at most `count`,
+    one a cube.
 
     Args:    name: of the note that counts those that were added.
-    Choices: triangulated points show where the photos have texture, those of depth what lies between; a cube with both
-      keeps the triangulated one.
+    Choices: triangulated points show where the photos have texture, those of depth what lies
+      between; a cube with both keeps the triangulated one.
     """
     kept, found = reduced(joined(cloud, more), count, spacing)
     found["notes"] |= {name: int((kept >= len(cloud["means"])).sum())}
@@ -117,13 +135,16 @@ def filled(cloud: Cloud, more: Cloud, count: int, spacing: str = "even", name: s
 
 def joined(cloud: Cloud, more: Cloud) -> Cloud:
     """A cloud with the points of another one of the same views after its own."""
-    return cloud | {key: np.concatenate([cloud[key], more[key]]) for key in ("means", "colors", "seen_from")}
+    return cloud | {
+        key: np.concatenate([cloud[key], more[key]]) for key in ("means", "colors", "seen_from")
+    }
 
 
 def reduced(cloud: Cloud, count: int, spacing: str) -> tuple[np.ndarray, Cloud]:
     """Which points of a cloud are kept, at most `count`, and the cloud of these.
 
-    Args: spacing: even: one point a cube of one size; color: of cubes that are the smaller the more their points'
+    Args: spacing: even: one point a cube of one size; color: of cubes that are the smaller the more
+      their points'
           colours differ, and the mean of these colours.
     """
     colors, tracks, notes = cloud["colors"], cloud["tracks"], dict(cloud["notes"])
@@ -144,14 +165,21 @@ def reduced(cloud: Cloud, count: int, spacing: str) -> tuple[np.ndarray, Cloud]:
     return kept, cloud | same | {"colors": colors, "tracks": tracks, "notes": notes}
 
 
-def from_depth(job: Job, capture: Capture, settings: SfmSection, poses: np.ndarray | None = None) -> Cloud:
-    """Points back-projected from the depth of training views, CANDIDATES times as many as are wanted, in random order.
+def from_depth(
+    job: Job, capture: Capture, settings: SfmSection, poses: np.ndarray | None = None
+) -> Cloud:
+    """Points back-projected from the depth of training views, CANDIDATES times as many as are
+    wanted, in random order.
 
-    Args: poses [V, 4, 4]: of the capture's views where they were adjusted; their depth goes with them.
+    Args: poses [V, 4, 4]: of the capture's views where they were adjusted; their depth goes with
+      them.
     Choices: test views give no points; pixels are drawn evenly over views.
     """
     assert capture.cam_from_world is not None and capture.depth is not None
-    rng, poses = np.random.default_rng(settings.seed), capture.cam_from_world if poses is None else poses
+    rng, poses = (
+        np.random.default_rng(settings.seed),
+        capture.cam_from_world if poses is None else poses,
+    )
     used = np.flatnonzero(~capture.is_test)
     per_view = max(CANDIDATES * settings.max_points // max(len(used), 1), 16)
     means, colors, seen = [], [], []
@@ -168,7 +196,9 @@ def from_depth(job: Job, capture: Capture, settings: SfmSection, poses: np.ndarr
         status["points"] = sum(map(len, means))
     points = np.concatenate(means)
     if len(points) == 0:
-        raise DataFailure("no training view has a pixel with depth; ingest the source without depth instead")
+        raise DataFailure(
+            "no training view has a pixel with depth; ingest the source without depth instead"
+        )
     order = rng.permutation(len(points))
     return {
         "names": list(capture.names),
@@ -185,8 +215,10 @@ def from_depth(job: Job, capture: Capture, settings: SfmSection, poses: np.ndarr
 def from_source(capture: Capture, settings: SfmSection) -> Cloud:
     """The source's own points that a training view has in its image, thinned to one a voxel.
 
-    Choices: a point is taken as seen from the nearest such view, which turns its normal; walls in between are not
-    looked for. Points without colours, or with some that tell nothing, take the pixels there (`tell_of`).
+    Choices: a point is taken as seen from the nearest such view, which turns its normal; walls in
+      between are not
+    looked for. Points without colours, or with some that tell nothing, take the pixels there
+    (`tell_of`).
     """
     assert capture.cam_from_world is not None and capture.points is not None
     kept = thin(capture.points, settings.max_points)
@@ -200,17 +232,32 @@ def from_source(capture: Capture, settings: SfmSection) -> Cloud:
         u, v = ((camera / np.maximum(camera[:, 2:], 1e-6)) @ capture.Ks[view].T)[:, :2].T
         away = np.linalg.norm(points - centers(pose[None])[0], axis=1)
         if len(tracks):
-            away = np.where(np.isin(np.arange(len(points)), tracks[tracks[:, 1] == view, 0]), away, np.inf)
-        nearer = (camera[:, 2] > 0.01) & (u >= 0) & (u < width) & (v >= 0) & (v < height) & (away < distance)
+            away = np.where(
+                np.isin(np.arange(len(points)), tracks[tracks[:, 1] == view, 0]), away, np.inf
+            )
+        nearer = (
+            (camera[:, 2] > 0.01)
+            & (u >= 0)
+            & (u < width)
+            & (v >= 0)
+            & (v < height)
+            & (away < distance)
+        )
         distance[nearer], seen[nearer] = away[nearer], view
         pixels[nearer] = capture.images[view][v[nearer].astype(int), u[nearer].astype(int)]
     inside = seen >= 0
     if colors is not None and not tell_of(colors[kept][inside], pixels[inside]):
-        log.warning("the source's colours of points tell nothing of the photos; the photos' own are taken")
+        log.warning(
+            "the source's colours of points tell nothing of the photos; the photos' own are taken"
+        )
         colors = None
     colors = pixels if colors is None else colors[kept]
     tracks = tracks_of(capture, kept[inside])
-    log.info("%d of the source's %d points are used; nothing is matched", inside.sum(), len(capture.points))
+    log.info(
+        "%d of the source's %d points are used; nothing is matched",
+        inside.sum(),
+        len(capture.points),
+    )
     return {
         "names": list(capture.names),
         "Ks": capture.Ks,
@@ -219,12 +266,18 @@ def from_source(capture: Capture, settings: SfmSection) -> Cloud:
         "colors": colors[inside],
         "seen_from": seen[inside],
         "tracks": tracks,
-        "notes": {"how": "source", "n_candidates": len(capture.points), "n_unseen": int((~inside).sum())},
+        "notes": {
+            "how": "source",
+            "n_candidates": len(capture.points),
+            "n_unseen": int((~inside).sum()),
+        },
     }
 
 
 def tracks_of(capture: Capture, kept: np.ndarray) -> np.ndarray:
-    """The source's tracks i32 [T, 2] (point, view) of some of its points, which are counted anew; none without any."""
+    """The source's tracks i32 [T, 2] (point, view) of some of its points, which are counted anew;
+    none without any.
+    """
     if capture.points is None or capture.tracks is None:
         return np.zeros((0, 2), np.int32)
     place = np.full(len(capture.points), -1)

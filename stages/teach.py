@@ -1,5 +1,5 @@
-"""teach: the encoder that scenes start from, taught over generated rooms what a 2D teacher says of them, and what these
-rooms teach as lessons.
+"""teach: the encoder that scenes start from, taught over generated rooms what a 2D teacher says of
+them, and what these rooms teach as lessons.
 
 See docs/method.md, section 14.
 """
@@ -60,22 +60,38 @@ def run(job: Job) -> None:
     settings, channels = job.config.teach, ChannelMap.read(job.inputs["channels"])
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     if teacher.output != "features":
-        raise ConfigError(f"{teacher.settings}: output is {teacher.output}; knowledge is taught in features")
+        raise ConfigError(
+            f"{teacher.settings}: output is {teacher.output}; knowledge is taught in features"
+        )
     if channels.notes.get("digest") != teacher.digest():
-        raise InputError(f"{job.inputs['channels']} is of another teacher than {teacher.path}; pass its own")
+        raise InputError(
+            f"{job.inputs['channels']} is of another teacher than {teacher.path}; pass its own"
+        )
     rooms = prepared(job, settings, channels.matrix)
     lessons, tested = rooms[: settings.n_rooms], rooms[settings.n_rooms :]
     words, embeddings = vocabulary(teacher, list(CLASS_NAMES), channels.matrix)
     named = found(list(CLASS_NAMES), words)
     if -1 in named:
-        job.left_out("figures on rooms held out", f"the teacher has no word for {CLASS_NAMES[named.index(-1)]}")
+        job.left_out(
+            "figures on rooms held out",
+            f"the teacher has no word for {CLASS_NAMES[named.index(-1)]}",
+        )
     classes = embeddings if -1 in named else embeddings[named]
     examples = [example_of(room, classes) for kinds in zip(*lessons, strict=True) for room in kinds]
     if bare := sum(bool((example.n_views < LEAST_VIEWS).all()) for example in examples):
-        raise DataFailure(f"{bare} rooms have no point that {LEAST_VIEWS} photos see; raise teach.n_views")
+        raise DataFailure(
+            f"{bare} rooms have no point that {LEAST_VIEWS} photos see; raise teach.n_views"
+        )
     encoder = taught(job, settings, examples)
-    weights = {name: value.numpy() for name, value in encoder.state_dict().items() if not name.startswith("head.")}
-    of_rooms = [mean_lesson(job, encoder, lessons[part::PARTS], classes) for part in range(min(PARTS, len(lessons)))]
+    weights = {
+        name: value.numpy()
+        for name, value in encoder.state_dict().items()
+        if not name.startswith("head.")
+    }
+    of_rooms = [
+        mean_lesson(job, encoder, lessons[part::PARTS], classes)
+        for part in range(min(PARTS, len(lessons)))
+    ]
     found_map = mapped(of_rooms, [], []).astype(np.float32)
     whole = mean_of(of_rooms)
     scale = scale_of(whole)
@@ -87,10 +103,16 @@ def run(job: Job) -> None:
         sums = [lesson_of(z, room, classes) for z, room in zip(encoded, of, strict=True)]
         newest[name] = max(scaled_novelty(novelty(one, scale, known), one.spread()) for one in sums)
         if -1 not in named:
-            card[name] = measured([z @ found_map[:, : len(classes[0])] for z in encoded], of, classes)
+            card[name] = measured(
+                [z @ found_map[:, : len(classes[0])] for z in encoded], of, classes
+            )
     card["novelty"] = newest
     job.facts |= card
-    describe = {name: value for name, value in DescribeSection().model_dump(mode="json").items() if name in SEEN}
+    describe = {
+        name: value
+        for name, value in DescribeSection().model_dump(mode="json").items()
+        if name in SEEN
+    }
     write_knowledge(
         job.out,
         Knowledge(
@@ -101,10 +123,15 @@ def run(job: Job) -> None:
     )  # fmt: skip
 
 
-def mean_lesson(job: Job, encoder: PointEncoder, rooms: Sequence[Sequence[Room]], embeddings: np.ndarray) -> Sums:
+def mean_lesson(
+    job: Job, encoder: PointEncoder, rooms: Sequence[Sequence[Room]], embeddings: np.ndarray
+) -> Sums:
     """The mean lesson of rooms, each as depth has it, worn, half seen and swept."""
     flat = [room for kinds in rooms for room in kinds]
-    parts = (drawn_lesson(encoder, room, embeddings) for room, _ in job.progress.track(flat, len(flat), "lessons"))
+    parts = (
+        drawn_lesson(encoder, room, embeddings)
+        for room, _ in job.progress.track(flat, len(flat), "lessons")
+    )
     total = combined([next(parts)], [1 / len(flat)])
     for one in parts:
         total = combined([total, one], [1.0, 1 / len(flat)])
@@ -112,7 +139,9 @@ def mean_lesson(job: Job, encoder: PointEncoder, rooms: Sequence[Sequence[Room]]
 
 
 def drawn_lesson(encoder: PointEncoder, room: Room, embeddings: np.ndarray) -> Sums:
-    """What N_DRAWN points of a room teach, drawn by how much each teaches: among many rooms as good as all of them."""
+    """What N_DRAWN points of a room teach, drawn by how much each teaches: among many rooms as good
+    as all of them.
+    """
     meanings, chances = told(room, embeddings)
     rows = np.random.default_rng(0).choice(len(chances), N_DRAWN, p=chances)
     return summed(encoder.encode(room.inputs, rows), meanings[rows], np.ones(N_DRAWN))
@@ -134,14 +163,20 @@ def told(room: Room, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return meanings, odds(room.n_views, labels)
 
 
-def vocabulary(teacher: TeacherModel, names: list[str], matrix: np.ndarray) -> tuple[list[str], np.ndarray]:
-    """Words that the teacher knows, of its table, otherwise these names; and their embeddings f32 [W, d]."""
+def vocabulary(
+    teacher: TeacherModel, names: list[str], matrix: np.ndarray
+) -> tuple[list[str], np.ndarray]:
+    """Words that the teacher knows, of its table, otherwise these names; and their embeddings f32
+    [W, d].
+    """
     words = names if teacher.labels is None else read_label_table(teacher.labels)[0]
     return words, text_embeddings(words, teacher) @ matrix
 
 
 def prepared(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[list[Room]]:
-    """The rooms to teach on, then those held out: clean, worn, half seen, swept; a process for each thread."""
+    """The rooms to teach on, then those held out: clean, worn, half seen, swept; a process for each
+    thread.
+    """
     seeds = [*KNOWLEDGE[: settings.n_rooms], *KNOWLEDGE[-settings.n_held_out :]]
     folder = job.scratch / "rooms"
     folder.mkdir(parents=True, exist_ok=True)
@@ -154,7 +189,9 @@ def prepared(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[list[
         with ProcessPoolExecutor(n_threads(), mp_context=context) as pool:
             jobs = [pool.submit(prepare, folder, seed, settings, matrix) for seed in missing]
             done = as_completed(jobs)
-            for finished, _ in job.progress.track(done, len(seeds), "rooms", len(seeds) - len(missing)):
+            for finished, _ in job.progress.track(
+                done, len(seeds), "rooms", len(seeds) - len(missing)
+            ):
                 finished.result()
                 job.watch.keep(job.scratch)
     return [held(folder, seed) for seed in seeds]
@@ -184,11 +221,21 @@ def taught(job: Job, settings: TeachSection, examples: list[Example]) -> PointEn
     return encoder.eval()
 
 
-def measured(answers: Sequence[np.ndarray], rooms: Sequence[Room], embeddings: np.ndarray) -> dict[str, float]:
-    """Of points of rooms held out, the share whose label is right: by the teacher's averages, by shape, and by both."""
+def measured(
+    answers: Sequence[np.ndarray], rooms: Sequence[Room], embeddings: np.ndarray
+) -> dict[str, float]:
+    """Of points of rooms held out, the share whose label is right: by the teacher's averages, by
+    shape, and by both.
+    """
     right: dict[str, list[float]] = {"teacher": [], "shape": [], "both": []}
     for shape, room in zip(answers, rooms, strict=True):
         known = (room.labels >= 0) & (room.n_views > 0)
-        for name, features in (("teacher", room.features), ("shape", shape), ("both", room.features + shape)):
-            right[name].append(float((decode_labels(features, embeddings) == room.labels)[known].mean()))
+        for name, features in (
+            ("teacher", room.features),
+            ("shape", shape),
+            ("both", room.features + shape),
+        ):
+            right[name].append(
+                float((decode_labels(features, embeddings) == room.labels)[known].mean())
+            )
     return {name: float(np.mean(values)) for name, values in right.items()}

@@ -1,4 +1,6 @@
-"""teacher: per-view semantic features, from the capture's labels through a noise model or from an ONNX model."""
+"""teacher: per-view semantic features, from the capture's labels through a noise model or from an
+ONNX model.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +31,11 @@ MIRRORED = 25  # views, of which one is looked at mirrored, too: 4 % of the stag
 
 
 def run(job: Job) -> None:
-    """Features, labels and their confidence of every view, as a 2D teacher sees it (docs/method.md, section 9).
+    """Features, labels and their confidence of every view, as a 2D teacher sees it (docs/method.md,
+    section 9).
 
-    Reads `capture` and, where an ONNX teacher's channels are reduced, `channels`. Writes `features`.
+    Reads `capture` and, where an ONNX teacher's channels are reduced, `channels`. Writes
+    `features`.
     """
     settings, capture = job.config.teacher, Capture.read(job.inputs["capture"])
     if settings.kind == "none":
@@ -39,7 +43,11 @@ def run(job: Job) -> None:
     if settings.kind in ("labels", "given"):
         make = from_labels if settings.kind == "labels" else from_pseudo_labels
         features = make(job, capture, settings)
-        job.facts |= {"kind": settings.kind, "n_labels": len(features.label_names), "convention": features.convention}
+        job.facts |= {
+            "kind": settings.kind,
+            "n_labels": len(features.label_names),
+            "convention": features.convention,
+        }
         job.facts["right"] = pixels_right(capture, features)
         features.write(job.out)
     else:
@@ -47,7 +55,8 @@ def run(job: Job) -> None:
 
 
 def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
-    """Features of every view by an ONNX model, the embedded one if none is given; of a killed run, finished views stay.
+    """Features of every view by an ONNX model, the embedded one if none is given; of a killed run,
+    finished views stay.
 
     Choices: test views are encoded too, because evaluate reports the teacher's own figures on them.
     """
@@ -56,7 +65,9 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     if job.device == "cuda" and CUDA not in providers(job.device):
         job.left_out("the teacher on the GPU", f"onnxruntime here has no CUDA ({GPU_REMEDY})")
     if teacher.guessed:
-        log.info("%s has no `output`: logits, as %s holds names alone", teacher.settings, teacher.labels)
+        log.info(
+            "%s has no `output`: logits, as %s holds names alone", teacher.settings, teacher.labels
+        )
     grid, n_channels = network.grid(capture.images[0], settings.downscale)
     channels = None
     if teacher.output == "logits":
@@ -68,7 +79,8 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
             channels = ChannelMap.read(job.inputs["channels"])
         elif n_channels > MAX_CHANNELS:
             raise ConfigError(
-                f"{teacher.path} has {n_channels} channels, at most {MAX_CHANNELS} can be rendered; use "
+                f"{teacher.path} has {n_channels} channels, at most {MAX_CHANNELS} can be "
+                "rendered; use "
                 "`chebsplat run`, or reduce them with `chebsplat channels` and pass --in-channels"
             )
         labels = label_set(teacher, settings.labels, capture.class_names)
@@ -97,10 +109,16 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     waiting = [view for view in range(len(capture.names)) if view not in writer.done]
     if writer.done:
         job.watch.go_on(job.scratch)
-        log.info("%d of %d views are there from a run that was stopped", len(writer.done), len(capture.names))
+        log.info(
+            "%d of %d views are there from a run that was stopped",
+            len(writer.done),
+            len(capture.names),
+        )
     for view, _ in job.progress.track(waiting, len(capture.names), "teacher", len(writer.done)):
         name = capture.names[view]
-        features = network.features(capture.images[view], grid, settings.scales, settings.flips, name)
+        features = network.features(
+            capture.images[view], grid, settings.scales, settings.flips, name
+        )
         writer.add(view, *space.split(features))
         job.watch.keep(job.scratch)
     made = writer.finish(job.out, space.names, space.embeddings, convention, channels)
@@ -114,7 +132,10 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
         mirrored = space.split(network.features(image[:, ::-1], *once))[1]
         alike.append(float((upright == mirrored[:, ::-1]).mean()))
     job.facts |= {"kind": "onnx", "n_labels": len(space.names), "convention": convention}
-    job.facts |= {"mirrored_alike": float(np.mean(alike)) if alike else None, "right": pixels_right(capture, made)}
+    job.facts |= {
+        "mirrored_alike": float(np.mean(alike)) if alike else None,
+        "right": pixels_right(capture, made),
+    }
 
 
 def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Features:
@@ -123,10 +144,16 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
     Every view draws from its own generator, seeded by its name.
     """
     if capture.labels is None or not capture.class_names:
-        raise DataFailure("the capture has no labels; use teacher.kind = auto (the embedded teacher, or teacher.model)")
+        raise DataFailure(
+            "the capture has no labels; use teacher.kind = auto (the embedded "
+            "teacher, or teacher.model)"
+        )
     codes = class_codes(capture.class_names, settings.n_channels)
     training = np.flatnonzero(~capture.is_test)
-    images, labels = np.asarray(capture.images[:])[training], np.asarray(capture.labels[:])[training]
+    images, labels = (
+        np.asarray(capture.images[:])[training],
+        np.asarray(capture.labels[:])[training],
+    )
     probabilities = model.confusable(model.class_colors(images, labels, len(codes)))
     rows = []
     for view, _ in job.progress.track(range(len(capture.names)), len(capture.names), "teacher"):
@@ -134,26 +161,49 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
         generator = np.random.default_rng([settings.seed, int.from_bytes(name[:8], "big")])
         small = model.reduced(capture.labels[view], settings.downscale)
         confused = model.confuse_segments(small, probabilities, settings.confusion, generator)
-        rows.append(model.noisy_features(confused, codes, settings.blur, settings.noise, generator).astype(np.float16))
+        rows.append(
+            model.noisy_features(confused, codes, settings.blur, settings.noise, generator).astype(
+                np.float16
+            )
+        )
     features = np.stack(rows)
     pseudo, confidence = decode(features.astype(np.float32), codes)
     ignored = ~features.any(-1)
     pseudo[ignored], confidence[ignored] = model.IGNORE, 0.0
-    convention = {"kind": "labels", "normalized": True, "n_scales": 1, "flips": False} | settings.model_dump(
+    convention = {
+        "kind": "labels",
+        "normalized": True,
+        "n_scales": 1,
+        "flips": False,
+    } | settings.model_dump(
         mode="json", include={"downscale", "confusion", "blur", "noise", "seed", "n_channels"}
     )
-    return Features(capture.names, features, capture.class_names, codes, pseudo, confidence, convention)
+    return Features(
+        capture.names, features, capture.class_names, codes, pseudo, confidence, convention
+    )
 
 
 def from_pseudo_labels(job: Job, capture: Capture, settings: TeacherSection) -> Features:
-    """What a 2D network took the views for, as the source brings it; a pixel weighs as much as it is sure."""
+    """What a 2D network took the views for, as the source brings it; a pixel weighs as much as it
+    is sure.
+    """
     if capture.pseudo_labels is None or capture.confidence is None or not capture.class_names:
-        raise DataFailure("the capture has no pseudo labels with confidences; use teacher.kind = auto")
+        raise DataFailure(
+            "the capture has no pseudo labels with confidences; use teacher.kind = auto"
+        )
     codes = class_codes(capture.class_names, settings.n_channels)
     views = []
     for view, _ in job.progress.track(range(len(capture.names)), len(capture.names), "teacher"):
-        views.append(voted(capture.pseudo_labels[view], capture.confidence[view], codes, settings.downscale))
+        views.append(
+            voted(capture.pseudo_labels[view], capture.confidence[view], codes, settings.downscale)
+        )
     features, labels, confidence = (np.stack(parts) for parts in zip(*views, strict=True))
-    convention = {"kind": "given", "normalized": True, "n_scales": 1, "flips": False, "downscale": settings.downscale}
+    convention = {
+        "kind": "given",
+        "normalized": True,
+        "n_scales": 1,
+        "flips": False,
+        "downscale": settings.downscale,
+    }
     half = features.astype(np.float16), labels, confidence.astype(np.float16)
     return Features(capture.names, half[0], capture.class_names, codes, *half[1:], convention)

@@ -22,8 +22,8 @@ log = logging.getLogger("chebsplat")
 def run(job: Job) -> None:
     """Optimise Gaussians and their semantics (Eqs 11-13; docs/method.md, sections 3 to 8).
 
-    Reads `capture`, `points` and, with semantics, `features`; in a sequence, the `gaussians` of the scene before.
-    Writes `gaussians`.
+    Reads `capture`, `points` and, with semantics, `features`; in a sequence, the `gaussians` of the
+    scene before. Writes `gaussians`.
     """
     inputs = read_inputs(job)
     trainer = assemble(job, inputs)
@@ -37,10 +37,14 @@ def run(job: Job) -> None:
     if population.n_broken:
         log.warning("%d Gaussians became non-finite and were removed", population.n_broken)
     if parameters["degrees"].size == 0:
-        raise DataFailure("no Gaussian is left; lower train.weight_mask or raise train.min_gaussians")
+        raise DataFailure(
+            "no Gaussian is left; lower train.weight_mask or raise train.min_gaussians"
+        )
     job.facts |= facts_of(job, trainer, parameters, features) | {"psnr": trace[-1]["psnr"]}
     if features is not None and "features" in parameters:
-        job.facts["right"] = labels_right(inputs.capture, parameters, parameters["features"], features)
+        job.facts["right"] = labels_right(
+            inputs.capture, parameters, parameters["features"], features
+        )
     modules = {
         f"{n}.{k}": v.detach().cpu().numpy()
         for n, m in trainer.model.modules.items()
@@ -48,9 +52,16 @@ def run(job: Job) -> None:
     }
     modules |= {KNOWLEDGE + name: basis.numpy() for name, basis in bases.items()}
     cameras = Cameras(points.names, points.Ks, points.cam_from_world, *inputs.capture.size)
-    notes: dict[str, Any] = {"left_out": job.facts.get("left_out", {}), "n_added": population.n_added}
+    notes: dict[str, Any] = {
+        "left_out": job.facts.get("left_out", {}),
+        "n_added": population.n_added,
+    }
     notes |= World.read(inputs.capture.source).notes
-    notes |= {"n_removed": population.n_removed, "n_broken": population.n_broken, "n_initial": n_initial}
+    notes |= {
+        "n_removed": population.n_removed,
+        "n_broken": population.n_broken,
+        "n_initial": n_initial,
+    }
     if features is not None:
         notes |= {"label_names": features.label_names, "convention": features.convention}
     Gaussians(parameters, cameras, modules, trace, notes).write(job.out)

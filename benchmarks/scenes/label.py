@@ -1,9 +1,12 @@
-"""Are a splat's Gaussians named right by shape and knowledge alone? Scenes that knowledge was not taught on, as a PLY.
+"""Are a splat's Gaussians named right by shape and knowledge alone? Scenes that knowledge was not
+taught on, as a PLY.
 
-Every scene is trained as it comes (as `query` trains it), once a seed, and only its PLY, without features, is named as
-`chebsplat label` names it: told which way is up and what a metre is, shown no photo. The truth of a Gaussian is what
-the true labels of all views say of it, lifted with the weights that it is rendered with. The houses need the test data
-(CHEBSPLAT_TEST_DATA), and are left out without it.
+Every scene is trained as it comes (as `query` trains it), once a seed, and only its PLY, without
+features, is named as
+`chebsplat label` names it: told which way is up and what a metre is, shown no photo. The truth of a
+  Gaussian is what
+the true labels of all views say of it, lifted with the weights that it is rendered with. The houses
+need the test data (CHEBSPLAT_TEST_DATA), and are left out without it.
 """
 
 from __future__ import annotations
@@ -29,11 +32,14 @@ from chebsplat.splats.gaussians import activated
 from chebsplat.stages.shape_models.surfaces import up_of
 from chebsplat.stages.tools.lift_ply import label_ply
 
-SCENES = {"office0": 0.8, "room0": 0.8, "shuffled0": 0.8, "shuffled1": 0.8, "kitchen": 0.6}  # and what is asked of each
+# and what is asked of each
+SCENES = {"office0": 0.8, "room0": 0.8, "shuffled0": 0.8, "shuffled1": 0.8, "kitchen": 0.6}
 
 
 def true_labels(made: Mapping[str, Path], gaussians: Gaussians) -> np.ndarray:
-    """The label [N] that most of what shows a Gaussian has, over all views; -1: none. Artifacts by stage."""
+    """The label [N] that most of what shows a Gaussian has, over all views; -1: none. Artifacts by
+    stage.
+    """
     capture, cameras = Capture.read(made["ingest"]), gaussians.cameras
     assert capture.labels is not None and capture.class_names
     raw = {name: torch.from_numpy(values) for name, values in gaussians.parameters.items()}
@@ -43,14 +49,18 @@ def true_labels(made: Mapping[str, Path], gaussians: Gaussians) -> np.ndarray:
     size = cameras.width, cameras.height
     for name, pose, K in zip(cameras.names, cameras.cam_from_world, cameras.Ks, strict=True):
         labels = capture.labels[row[name]]
-        said = to_cells(np.eye(n, dtype=np.float32)[labels.clip(0)], (labels >= 0).astype(np.float32), size)
+        said = to_cells(
+            np.eye(n, dtype=np.float32)[labels.clip(0)], (labels >= 0).astype(np.float32), size
+        )
         seen = lift(shapes, pose, K, size, *said)
         votes[seen.ids] += seen.sums
     return np.where(votes.any(1), votes.argmax(1), -1)
 
 
 def named(made: Mapping[str, Path]) -> dict[str, Any]:
-    """Shares of a scene's Gaussians, and of the surer half of them, that bear their true label, and the mIoU."""
+    """Shares of a scene's Gaussians, and of the surer half of them, that bear their true label, and
+    the mIoU.
+    """
     gaussians, capture = Gaussians.read(made["train"]), Capture.read(made["ingest"])
     assert capture.class_names
     truth, words = true_labels(made, gaussians), list(capture.class_names)
@@ -84,9 +94,14 @@ def main(arguments: Sequence[str]) -> int:
     wanted = [(scene, steps + (f",train.seed={seed}" if seed else "")) for scene, seed in pairs]
     rows = []
     for (scene, seed), plan in zip(pairs, shared.finished(wanted, "train"), strict=True):
-        rows.append({"scene": scene, "seed": seed, **named(plan.targets), "bar": SCENES.get(scene, 0.0)})
-        print("{scene:<10} seed {seed}: {gaussians} Gaussians, {oa:.1%} named right (bar {bar:.0%}), of the surer half "
+        rows.append(
+            {"scene": scene, "seed": seed, **named(plan.targets), "bar": SCENES.get(scene, 0.0)}
+        )
+        print("{scene:<10} seed {seed}: {gaussians} Gaussians, {oa:.1%} named right (bar "
+              "{bar:.0%}), of the surer half "
               "{oa_surer_half:.1%}, mIoU {miou:.1%}".format(**rows[-1]), flush=True)  # fmt: skip
     shared.write_csv(options.out / "label.csv", rows)
-    means = {scene: np.mean([row["oa"] for row in rows if row["scene"] == scene]) for scene, _ in pairs}
+    means = {
+        scene: np.mean([row["oa"] for row in rows if row["scene"] == scene]) for scene, _ in pairs
+    }
     return int(any(mean < SCENES.get(scene, 0.0) for scene, mean in means.items()))

@@ -1,7 +1,8 @@
 """The lift of a teacher's features to a finished scene: seconds beside their bar.
 
-Every form lifts all views of the scene and averages them, with compiled kernels and maps that are in memory. They take
-turns, and the fastest round of each counts; processor seconds, of all threads, tell what a busy machine hides.
+Every form lifts all views of the scene and averages them, with compiled kernels and maps that are
+in memory. They take turns, and the fastest round of each counts; processor seconds, of all threads,
+tell what a busy machine hides.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from chebsplat.rasterize.lift import lift
 from chebsplat.splats.gaussians import activated
 
 BAR = 4.0  # seconds, of all forms
-FORMS = {"mean": (0.0, 0), "gate": (0.05, 0), "gate and median": (0.05, 5)}  # the gate, and steps of the median
+# the gate, and steps of the median
+FORMS = {"mean": (0.0, 0), "gate": (0.05, 0), "gate and median": (0.05, 5)}
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -41,7 +43,14 @@ def main(arguments: Sequence[str]) -> int:
 
     def observed(gate: float) -> Observations:
         views = (
-            lift(gaussians, pose, K, capture.size, *to_cells(said, np.ones(said.shape[:2]), capture.size), gate)
+            lift(
+                gaussians,
+                pose,
+                K,
+                capture.size,
+                *to_cells(said, np.ones(said.shape[:2]), capture.size),
+                gate,
+            )
             for said, pose, K in zip(maps, cameras.cam_from_world, cameras.Ks, strict=True)
         )
         return gathered(len(gaussians[0]), maps[0].shape[-1], views)
@@ -58,11 +67,15 @@ def main(arguments: Sequence[str]) -> int:
             sizes[name] = len(observations.views)
     width, height = capture.size
     print(shared.machine())
-    print(f"{len(gaussians[0]):,} Gaussians, {len(maps)} views of {width}×{height}, {maps[0].shape[-1]} channels")
+    print(
+        f"{len(gaussians[0]):,} Gaussians, {len(maps)} views of {width}×{height}, "
+        f"{maps[0].shape[-1]} channels"
+    )
     rows = []
     for name, seconds in best.items():
         print(
-            f"{name:<16} {seconds:6.2f} s (bar {BAR:.0f} s), {spent[name]:.2f} of processors; {sizes[name]:,} observed"
+            f"{name:<16} {seconds:6.2f} s (bar {BAR:.0f} s), {spent[name]:.2f} of processors; "
+            f"{sizes[name]:,} observed"
         )
         rows.append(
             {

@@ -1,8 +1,10 @@
-"""Asking, at the suggested cut: precision and recall of every class of unseen rooms, and absent words refused.
+"""Asking, at the suggested cut: precision and recall of every class of unseen rooms, and absent
+words refused.
 
-Rooms are trained as they come (--settings), none of which a calibration has seen. A Gaussian is of the class of the
-nearest point of the true surface, within 10 cm; the few beyond do not count. Precision is over queries that select
-anything. Words that no room has are `measured` of teachers/words.toml.
+Rooms are trained as they come (--settings), none of which a calibration has seen. A Gaussian is of
+the class of the nearest point of the true surface, within 10 cm; the few beyond do not count.
+Precision is over queries that select anything. Words that no room has are `measured` of
+teachers/words.toml.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ def classes_of(scene: Scene, capture: Path) -> np.ndarray:
     held = Capture.read(capture)
     assert held.depth is not None and held.labels is not None and held.cam_from_world is not None
     points, classes = [], []
-    for depth, labels, K, pose in zip(held.depth, held.labels, held.Ks, held.cam_from_world, strict=True):
+    for depth, labels, K, pose in zip(
+        held.depth, held.labels, held.Ks, held.cam_from_world, strict=True
+    ):
         pixels = np.argwhere(np.isfinite(depth) & (depth > 0))[::7]
         points.append(unproject(depth, K, pose, pixels))
         classes.append(labels[pixels[:, 0], pixels[:, 1]])
@@ -62,9 +66,13 @@ def row(room: str, name: str, rows: list[tuple[int, int, int]]) -> dict[str, Any
 
 def main(arguments: Sequence[str]) -> int:
     parser = shared.parser("query", __doc__)
-    parser.add_argument("--scenes", default=SCENES, help="names of scenes with exact labels, with commas")
+    parser.add_argument(
+        "--scenes", default=SCENES, help="names of scenes with exact labels, with commas"
+    )
     parser.add_argument("--settings", default=SETTINGS, help="as set= takes them")
-    parser.add_argument("--folders", type=Path, nargs="*", help="of links of finished scenes, instead")
+    parser.add_argument(
+        "--folders", type=Path, nargs="*", help="of links of finished scenes, instead"
+    )
     options = parser.parse_args(arguments)
     folders = options.folders
     if not folders:
@@ -89,7 +97,10 @@ def main(arguments: Sequence[str]) -> int:
             for name, selected in scores.items():
                 here[name].append(counts(selected, truth, classes >= 0))
             found.append(bool(answer.present))
-        lacking = [bool(understood(folder / "teacher", word, []).answer(features).present) for word in absent]
+        lacking = [
+            bool(understood(folder / "teacher", word, []).answer(features).present)
+            for word in absent
+        ]
         refused += [not there for there in lacking]
         table += [row(folder.name.partition("@")[0], name, rows) for name, rows in here.items()]
         for name, rows in here.items():
@@ -99,7 +110,10 @@ def main(arguments: Sequence[str]) -> int:
     table += total
     shared.write_csv(options.out / "query.csv", table)
     for line in table:
-        cells = (f"{key} {value:.3f}" if isinstance(value, float) else str(value) for key, value in line.items())
+        cells = (
+            f"{key} {value:.3f}" if isinstance(value, float) else str(value)
+            for key, value in line.items()
+        )
         print("  ".join(cells))
     print(f"{len(folders)} rooms, {len(absent)} absent words, {shared.processor()}; bars: {BARS}")
     return int(any(total[0][name] < bar for name, bar in BARS.items()))

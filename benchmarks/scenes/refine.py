@@ -1,7 +1,9 @@
 """Error against run time of what follows a training: the lift, smoothing, and knowledge of shape.
 
-mIoU is of rendered test views, beside the processor seconds that each form takes once kernels are compiled, all that it
-needs included: knowledge needs the lift, for its evidence, and smoothing. Figures and picture go to `--out`.
+mIoU is of rendered test views, beside the processor seconds that each form takes once kernels are
+compiled, all that it
+needs included: knowledge needs the lift, for its evidence, and smoothing. Figures and picture go to
+  `--out`.
 """
 
 from __future__ import annotations
@@ -48,10 +50,19 @@ class Scene:
 
     def score(self, features: np.ndarray) -> tuple[float, float]:
         """mIoU and OA of the test views, by these features [N, C]."""
-        capture, cameras, names = self.capture, self.gaussians.cameras, list(self.capture.class_names or [])
+        capture, cameras, names = (
+            self.capture,
+            self.gaussians.cameras,
+            list(self.capture.class_names or []),
+        )
         parameters = self.gaussians.parameters
-        renderer, row = SceneRenderer(parameters | {"features": features}), {n: k for k, n in enumerate(capture.names)}
-        as_class = np.array([names.index(name) if name in names else len(names) for name in self.taught.label_names])
+        renderer, row = (
+            SceneRenderer(parameters | {"features": features}),
+            {n: k for k, n in enumerate(capture.names)},
+        )
+        as_class = np.array(
+            [names.index(name) if name in names else len(names) for name in self.taught.label_names]
+        )
         counts = np.zeros((len(names) + 1,) * 2, np.int64)
         for k, name in enumerate(cameras.names):
             if capture.is_test[row[name]]:
@@ -82,17 +93,29 @@ def main(arguments: Sequence[str]) -> None:
 
     def add(name: str, seconds: float, features: np.ndarray) -> None:
         miou, oa = scene.score(features)
-        rows.append({"form": name, "processor_seconds": round(seconds, 2), "miou": round(miou, 2), "oa": round(oa, 2)})
+        rows.append(
+            {
+                "form": name,
+                "processor_seconds": round(seconds, 2),
+                "miou": round(miou, 2),
+                "oa": round(oa, 2),
+            }
+        )
         print(f"{name:34s}{seconds:7.2f} s   mIoU {miou:5.1f}   OA {oa:5.1f}", flush=True)
 
     add("features as trained", 0.0, scene.features)
     add("lifted features", to_lift, lifted.features)
     add("smoothed", to_lift + to_compare + to_smooth, smoothed)
-    translated, described = into_channels(SHIPPED, shipped, scene.taught), Descriptors.read(options.work / "describe")
+    translated, described = (
+        into_channels(SHIPPED, shipped, scene.taught),
+        Descriptors.read(options.work / "describe"),
+    )
     inputs, (means, normals) = inputs_of(SHIPPED, described, shipped), in_scene(described)
 
     def known() -> np.ndarray:
-        return carry(translated(answered(shipped, inputs)), means, normals, scene.means, scene.surface[0])[0]
+        return carry(
+            translated(answered(shipped, inputs)), means, normals, scene.means, scene.surface[0]
+        )[0]
 
     knowledge, to_know = timed(known)
 
@@ -121,9 +144,13 @@ def draw(path: Path, rows: list[dict[str, Any]], scene: str) -> None:
     figure, axis = plt.subplots(figsize=(8, 4.2), layout="constrained")
     for number, row in enumerate(rows, 1):
         place, form = (row["processor_seconds"], row["miou"]), row["form"].removeprefix("and ")
-        axis.plot(*place, "o", color="C0" if "knowledge" in form else "C1", label=f"{number}  {form}")
+        axis.plot(
+            *place, "o", color="C0" if "knowledge" in form else "C1", label=f"{number}  {form}"
+        )
         axis.annotate(str(number), place, fontsize=9, xytext=(5, 4), textcoords="offset points")
-    figure.legend(loc="outside right upper", fontsize=8, handlelength=0, markerscale=0.6, frameon=False)
+    figure.legend(
+        loc="outside right upper", fontsize=8, handlelength=0, markerscale=0.6, frameon=False
+    )
     axis.set_xlabel("processor seconds after the training")
     axis.set_ylabel("mIoU of test views, %")
     axis.set_title(f"What follows a training: {scene.partition('@')[0]}", fontsize=10)

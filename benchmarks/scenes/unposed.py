@@ -1,7 +1,10 @@
-"""Photos that come alone: what the stage `pose` makes of them, beside pycolmap's defaults on the same files.
+"""Photos that come alone: what the stage `pose` makes of them, beside pycolmap's defaults on the
+same files.
 
-Errors are in units of the photo's longer side. A folder with a `truth.json`, which maps a photo's stem to its
-camera-to-world matrix in metres, is held against it, too: medians of the angle and of the distance after a similarity.
+Errors are in units of the photo's longer side. A folder with a `truth.json`, which maps a photo's
+stem to its
+camera-to-world matrix in metres, is held against it, too: medians of the angle and of the distance
+  after a similarity.
 """
 
 from __future__ import annotations
@@ -30,12 +33,17 @@ FAR = 0.1  # metres: a photo that misses its place by more is misplaced
 
 def main(arguments: Sequence[str]) -> int:
     parser = shared.parser("unposed", __doc__)
-    parser.add_argument("captures", type=Path, nargs="+", help="folders of photos, each with its photos in images/")
+    parser.add_argument(
+        "captures", type=Path, nargs="+", help="folders of photos, each with its photos in images/"
+    )
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args(arguments)
     os.environ["OMP_NUM_THREADS"] = str(options.threads)
     print(shared.machine())
-    print("| capture | photos | registered | theirs | points | theirs | error | theirs | seconds | theirs | truth |")
+    print(
+        "| capture | photos | registered | theirs | points | theirs | error | theirs | seconds "
+        "| theirs | truth |"
+    )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for folder in options.captures:
         photos = folder / "images"
@@ -47,11 +55,15 @@ def main(arguments: Sequence[str]) -> int:
                     "pose", Path(scratch) / "model", source={"kind": "photos", "path": str(photos)}
                 ))  # fmt: skip
             except ChebsplatError as error:
-                print(f"| {folder.name} | {len(os.listdir(photos))} | {error} |{' |' * 8}", flush=True)
+                print(
+                    f"| {folder.name} | {len(os.listdir(photos))} | {error} |{' |' * 8}", flush=True
+                )
                 continue
             seconds, held = time.perf_counter() - began, model.judged
-            print(f"| {folder.name} | {held['n_given']} | {held['n_registered']} | {theirs.get('n')} | "
-                  f"{held['n_points']} | {theirs.get('points')} | {held['reprojection_error']:.2e} | "
+            print(f"| {folder.name} | {held['n_given']} | {held['n_registered']} | "
+                  f"{theirs.get('n')} | "
+                  f"{held['n_points']} | {theirs.get('points')} | "
+                  f"{held['reprojection_error']:.2e} | "
                   f"{theirs.get('error', np.nan):.2e} | {seconds:.0f} | {their_seconds:.0f} | "
                   f"{against(model, folder / 'truth.json')} |", flush=True)  # fmt: skip
             for doubt in held["doubts"]:
@@ -60,12 +72,16 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def defaults(photos: Path, place: Path, threads: int) -> tuple[dict[str, Any], float]:
-    """Photos, points and error of the largest model that pycolmap's defaults find with one SIMPLE_RADIAL camera."""
+    """Photos, points and error of the largest model that pycolmap's defaults find with one
+    SIMPLE_RADIAL camera.
+    """
     pycolmap.logging.minloglevel = 2
     began, database = time.perf_counter(), place / "theirs.db"
     extraction, matching = pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions()
     extraction.num_threads = matching.num_threads = threads
-    pycolmap.extract_features(database, photos, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=extraction)
+    pycolmap.extract_features(
+        database, photos, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=extraction
+    )
     pycolmap.match_exhaustive(database, matching)
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, 0
@@ -86,7 +102,8 @@ def defaults(photos: Path, place: Path, threads: int) -> tuple[dict[str, Any], f
 def against(model: PhotoModel, path: Path) -> str:
     """Medians of what a model's poses miss the true ones by, and how many do by more than FAR.
 
-    Choices: after the similarity that fits the half that it fits best, so that misplaced photos move no other.
+    Choices: after the similarity that fits the half that it fits best, so that misplaced photos
+      move no other.
     """
     if not path.exists():
         return "-"
@@ -101,4 +118,7 @@ def against(model: PhotoModel, path: Path) -> str:
         aligned[:, :3, 3] = -np.einsum("vij,vj->vi", aligned[:, :3, :3], places)
         moved, turned = differences(aligned, given)
         near = moved <= np.median(moved)
-    return f"{np.degrees(np.median(turned)):.2f}°, {100 * np.median(moved):.1f} cm, {(moved > FAR).sum()} misplaced"
+    return (
+        f"{np.degrees(np.median(turned)):.2f}°, {100 * np.median(moved):.1f} cm, "
+        f"{(moved > FAR).sum()} misplaced"
+    )

@@ -10,7 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.stability.case import Outcome, beside, case
-from chebsplat.lifting.blend import AGREED, ALIKE, SURE, blend, calibrate, confidence, effective, reliable
+from chebsplat.lifting.blend import (
+    AGREED,
+    ALIKE,
+    SURE,
+    blend,
+    calibrate,
+    confidence,
+    effective,
+    reliable,
+)
 from chebsplat.lifting.observations import LEAST_COSINE, N_POINTS, NEAR, carry
 from chebsplat.lifting.smoothing import Affinities
 
@@ -27,7 +36,9 @@ class Parts(NamedTuple):
     strength: float = 2.0
 
 
-def parts(feature: Any = 1.0, evidence: Any = 1.0, known: Any = 1.0, strength: float = 2.0) -> Parts:
+def parts(
+    feature: Any = 1.0, evidence: Any = 1.0, known: Any = 1.0, strength: float = 2.0
+) -> Parts:
     """Noise; known: lengths of what is known."""
     rng = np.random.default_rng(0)
     knowledge = rng.normal(size=(N, C))
@@ -74,7 +85,11 @@ def blends(name: str) -> Outcome:
     return beside(blend(*of), lambda: blended(of, np.float32), exact, TOLERANCE)
 
 
-@case("how sure a blend is of features of {size:.0e} by {views:.0e} views", size=[0.0, 1e-30, 1e30], views=[0.0, 2e9])
+@case(
+    "how sure a blend is of features of {size:.0e} by {views:.0e} views",
+    size=[0.0, 1e-30, 1e30],
+    views=[0.0, 2e9],
+)
 def sure(size: float, views: float) -> Outcome:
     """Against 80 bits."""
     of, n = parts(size), np.full(N, views).astype(np.int64)
@@ -85,7 +100,9 @@ def sure(size: float, views: float) -> Outcome:
         k = dtype(of.strength) * np.ones(N, dtype)
         lengths = np.sqrt((f * f).sum(1))
         known = g / np.sqrt((g * g).sum(1))[:, None]
-        direction = f / (np.where(lengths > 0, lengths, 1) if dtype is np.longdouble else lengths)[:, None]
+        direction = (
+            f / (np.where(lengths > 0, lengths, 1) if dtype is np.longdouble else lengths)[:, None]
+        )
         summed = e[:, None] * direction + k[:, None] * known
         return np.asarray(np.sqrt((summed * summed).sum(1)) / (e + 1 + k))
 
@@ -102,7 +119,9 @@ def halves(size: float) -> Outcome:
     def counted(dtype: type) -> np.ndarray:
         a, b = both.astype(dtype)
         lengths = np.sqrt((a * a).sum(1)) * np.sqrt((b * b).sum(1))
-        cosines = (a * b).sum(1) / (np.where(lengths > 0, lengths, 1) if dtype is np.longdouble else lengths)
+        cosines = (a * b).sum(1) / (
+            np.where(lengths > 0, lengths, 1) if dtype is np.longdouble else lengths
+        )
         return np.asarray(cosines.clip(0, 1) ** AGREED * n / (1 + dtype(ALIKE) * (n - 1)))
 
     found = reliable(both, np.ones((2, N))) * effective(n)
@@ -112,7 +131,10 @@ def halves(size: float) -> Outcome:
 @case("a strength is chosen alike for features of {size:.0e}", size=[1e-30, 1e-10, 1e10, 1e30])
 def chosen(size: float) -> Outcome:
     """Agreement of the halves as for features of 1, which only directions tell."""
-    rng, near = np.random.default_rng(0), Affinities(np.zeros((N, 0), np.int32), np.zeros((N, 0), np.float32))
+    rng, near = (
+        np.random.default_rng(0),
+        Affinities(np.zeros((N, 0), np.int32), np.zeros((N, 0), np.float32)),
+    )
     both, n = (rng.normal(size=(2, N, C)) + 1).astype(np.float32), np.full((2, N), 3)
 
     def agreement(dtype: type, size: float) -> list[float]:
@@ -126,7 +148,9 @@ def chosen(size: float) -> Outcome:
 
 
 class Known(NamedTuple):
-    """values at points with normals, carried to means with normals; unit: scene units of a metre."""
+    """values at points with normals, carried to means with normals; unit: scene units of a
+    metre.
+    """
 
     values: np.ndarray
     points: np.ndarray
@@ -142,7 +166,13 @@ def known(n_points: int = 40, units: float = 1.0, shift: float = 0.0, far: float
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     places = units * rng.uniform(0, 1, (n_points + N, 3)) + shift
     places[n_points:, 0] += far
-    of = rng.normal(size=(n_points, C)), places[:n_points], normals[:n_points], places[n_points:], normals[n_points:]
+    of = (
+        rng.normal(size=(n_points, C)),
+        places[:n_points],
+        normals[:n_points],
+        places[n_points:],
+        normals[n_points:],
+    )
     return Known(*of, units)
 
 
@@ -156,7 +186,9 @@ CARRIED: dict[str, Callable[[], Known]] = {
     "Gaussians 1e+08 away": lambda: known(far=1e8),
     "Gaussians at the points": lambda: known()._replace(means=known().points[:N]),
     "points in one place": lambda: known(3)._replace(points=np.full((3, 3), 0.5)),
-    "normals at right angles": lambda: known()._replace(point_normals=np.eye(3)[[0] * 40], normals=np.eye(3)[[1] * N]),
+    "normals at right angles": lambda: known()._replace(
+        point_normals=np.eye(3)[[0] * 40], normals=np.eye(3)[[1] * N]
+    ),
     "values of 1e-30": lambda: known()._replace(values=1e-30 * known().values),
     "values of 1e+30": lambda: known()._replace(values=1e30 * known().values),
 }

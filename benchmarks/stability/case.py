@@ -15,9 +15,11 @@ import numpy as np
 class Outcome(NamedTuple):
     """What a case returns; it passes if error <= tolerance, so NaN fails."""
 
-    error: float  # of our float32 result, relative to the oracle's largest value unless the module says otherwise
+    # of our float32 result, relative to the oracle's largest value unless the module says otherwise
+    error: float
     tolerance: float
-    naive: float = float("nan")  # error of the plain way to compute the same in float32, where the case has one
+    # error of the plain way to compute the same in float32, where the case has one
+    naive: float = float("nan")
 
 
 class Row(NamedTuple):
@@ -34,8 +36,11 @@ class Row(NamedTuple):
 CASES: dict[tuple[str, str], Callable[[], Outcome]] = {}
 
 
-def case(name: str, /, **values: Iterable[Any]) -> Callable[[Callable[..., Outcome]], Callable[..., Outcome]]:
-    """Register a function as a case of its module, or as one for each combination of keyword values.
+def case(
+    name: str, /, **values: Iterable[Any]
+) -> Callable[[Callable[..., Outcome]], Callable[..., Outcome]]:
+    """Register a function as a case of its module, or as one for each combination of keyword
+    values.
 
     Args: name: unique in its module; keyword values are filled in by `str.format`.
     """
@@ -67,7 +72,9 @@ def run(key: tuple[str, str]) -> Row:
 
 
 def relative(found: Any, exact: Any) -> float:
-    """Largest absolute difference over the largest absolute value (over 1 where that is 0); inf where not finite."""
+    """Largest absolute difference over the largest absolute value (over 1 where that is 0); inf
+    where not finite.
+    """
     found, exact = np.asarray(found, np.float64), np.asarray(exact, np.float64)
     if found.shape != exact.shape or not (np.isfinite(found).all() and np.isfinite(exact).all()):
         return float("inf")
@@ -77,13 +84,20 @@ def relative(found: Any, exact: Any) -> float:
 
 
 def beside(
-    found: Any, naive: Callable[[], Any], exact: Any, tolerance: float, measure: Callable[[Any, Any], float] = relative
+    found: Any,
+    naive: Callable[[], Any],
+    exact: Any,
+    tolerance: float,
+    measure: Callable[[Any, Any], float] = relative,
 ) -> Outcome:
-    """What was found, and what the plain way finds, against what is exact; a plain way that raises is off by inf."""
+    """What was found, and what the plain way finds, against what is exact; a plain way that raises
+    is off by inf.
+    """
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         try:
             plain = measure(naive(), exact)
-        except (ArithmeticError, IndexError, RuntimeError, ValueError):  # LinAlgError is a ValueError
+        # LinAlgError is a ValueError
+        except (ArithmeticError, IndexError, RuntimeError, ValueError):
             plain = float("inf")
     return Outcome(measure(found, exact), tolerance, plain)

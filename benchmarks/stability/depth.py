@@ -33,7 +33,12 @@ Seen = tuple[Tensor, Tensor, Tensor, Tensor | None]  # inverse depth, coverage, 
 def surface(unit: float = 1.0, alpha: float = 0.9) -> Seen:
     """A surface at 0.5 to 1.5 units, measured, and rendered 10 % off."""
     truth, covered = unit * noise(HEIGHT, WIDTH), alpha * torch.ones(HEIGHT, WIDTH, 1)
-    return covered[..., 0] / truth * (0.9 + 0.2 * noise(HEIGHT, WIDTH, seed=1)), covered, truth, None
+    return (
+        covered[..., 0] / truth * (0.9 + 0.2 * noise(HEIGHT, WIDTH, seed=1)),
+        covered,
+        truth,
+        None,
+    )
 
 
 def measured(change: Callable[[Tensor], object], mask: Tensor | None = None) -> Seen:
@@ -64,7 +69,9 @@ def loss(name: str) -> Outcome:
     multiplication.
     """
     rendered, covered, truth, mask = LOSSES[name]()
-    known = np.isfinite(truth.numpy()) & (truth.numpy() > 0) & (True if mask is None else mask.numpy())
+    known = (
+        np.isfinite(truth.numpy()) & (truth.numpy() > 0) & (True if mask is None else mask.numpy())
+    )
     d, a = (part.double().numpy() for part in (truth, covered[..., 0]))
     missed = rendered.double().numpy()[known] * d[known] - a[known]
     exact = np.zeros(truth.shape)
@@ -97,7 +104,9 @@ def planes_of(cosines: np.ndarray, unit: float = 1.0) -> tuple[np.ndarray, np.nd
     return unit * np.tile(mean, (len(cosines), 1)), normals
 
 
-def corner(means: np.ndarray, normals: np.ndarray, nearest: float = 0.01, dtype: type = np.float64) -> np.ndarray:
+def corner(
+    means: np.ndarray, normals: np.ndarray, nearest: float = 0.01, dtype: type = np.float64
+) -> np.ndarray:
     """1 / z [N] of planes at a corner of the image."""
     given = (torch.from_numpy(part.astype(dtype)) for part in (means, normals, K))
     return np.asarray(inverse_depths(*given, nearest).numpy() @ np.array([WIDTH, HEIGHT, 1.0]))
@@ -116,7 +125,9 @@ def jumps(cosine: float) -> Outcome:
         values = normals @ np.linalg.inv(K) @ (WIDTH, HEIGHT, 1) / along
         return np.where(grazed, 1 / means[:, 2], values)
 
-    moved, plain = (float(np.abs(np.diff(values))[0]) for values in (corner(means, normals), plainly()))
+    moved, plain = (
+        float(np.abs(np.diff(values))[0]) for values in (corner(means, normals), plainly())
+    )
     return Outcome(moved, JUMP, plain)
 
 
@@ -132,23 +143,35 @@ def units(unit: float) -> Outcome:
 
 
 def wall(tilt: float, unit: float) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
-    """Gaussians that tile a wall through (0, 0, 2), their planes, and the depth [H, W] of the wall."""
+    """Gaussians that tile a wall through (0, 0, 2), their planes, and the depth [H, W] of the
+    wall.
+    """
     normal = np.array([np.sin(tilt), 0, -np.cos(tilt)])
     right, down = np.array([np.cos(tilt), 0, np.sin(tilt)]), np.array([0, 1.0, 0])
-    steps = np.stack(np.meshgrid(np.linspace(-4, 4, 60), np.linspace(-3, 3, 46), indexing="ij"), -1).reshape(-1, 2)
+    steps = np.stack(
+        np.meshgrid(np.linspace(-4, 4, 60), np.linspace(-3, 3, 46), indexing="ij"), -1
+    ).reshape(-1, 2)
     means = np.array([0, 0, 2.0]) + steps @ np.stack([right, down])
     means = means[means[:, 2] > 0.2]
     n, half = len(means), -tilt / 2
     quats = np.tile([np.cos(half), 0, np.sin(half), 0], (n, 1))
     scales, opacities = np.tile([0.1, 0.1, 1e-4], (n, 1)), np.full(n, 0.8)
-    planes = inverse_depths(*(torch.from_numpy(v) for v in (unit * means, np.tile(normal, (n, 1)), K)), 0.01 * unit)
+    planes = inverse_depths(
+        *(torch.from_numpy(v) for v in (unit * means, np.tile(normal, (n, 1)), K)), 0.01 * unit
+    )
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(K).T
-    gaussians = tuple(part.astype(np.float32) for part in (unit * means, quats, unit * scales, opacities))
+    gaussians = tuple(
+        part.astype(np.float32) for part in (unit * means, quats, unit * scales, opacities)
+    )
     return gaussians, planes.numpy(), 2 * unit * normal[2] / (rays @ normal)
 
 
-@case("the depth of a wall turned by {degrees} degrees, units of {unit:.0e}", degrees=[0, 40], unit=[0.1, 1e3])
+@case(
+    "the depth of a wall turned by {degrees} degrees, units of {unit:.0e}",
+    degrees=[0, 40],
+    unit=[0.1, 1e3],
+)
 def walls(degrees: float, unit: float) -> Outcome:
     """Relative, against the wall's own; the plain way takes the depth of the nearest Gaussian's
     centre.
@@ -176,16 +199,23 @@ def patch(unit: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @case("a plain wall in units of {unit:.0e}", unit=[1e-6, 1e-3, 1e3, 1e6])
 def plain_walls(unit: float) -> Outcome:
-    """What planes add, in units of the wall's depth; the plain way takes the mean of what is known."""
+    """What planes add, in units of the wall's depth; the plain way takes the mean of what is
+    known.
+    """
     depth, colors, exact = patch(unit)
     ones = np.ones_like(exact)
-    return beside(completed(depth, colors) / exact, lambda: depth[depth > 0].mean() / exact, ones, PLANES)
+    return beside(
+        completed(depth, colors) / exact, lambda: depth[depth > 0].mean() / exact, ones, PLANES
+    )
 
 
 UNKNOWN: dict[str, Callable[[np.ndarray], object]] = {
     "nothing known": lambda d: d.fill(0),
     "all known": lambda d: d.__setitem__(..., patch()[2]),
-    "known along a line": lambda d: (d.__setitem__(slice(1, None), 0), d.__setitem__(0, patch()[2][0])),
+    "known along a line": lambda d: (
+        d.__setitem__(slice(1, None), 0),
+        d.__setitem__(0, patch()[2][0]),
+    ),
     "known at one pixel": lambda d: (d.fill(0), d.__setitem__((3, 3), 2.0)),
 }
 

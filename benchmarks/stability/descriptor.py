@@ -1,6 +1,7 @@
 """Regions that break the printed descriptor (Eqs 1-6; docs/method.md, section 2).
 
-Errors are those of one region's float32 descriptor against 60 digits, relative to the region's largest value.
+Errors are those of one region's float32 descriptor against 60 digits, relative to the region's
+largest value.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ def cloud(n: int = 16, seed: int = 0) -> Region:
     rng = np.random.default_rng(seed)
     means = rng.normal(size=(n, 3)) * [1.0, 0.7, 0.2]
     scales = rng.random((n, 3)) * [0.3, 0.2, 0.02] + 0.01
-    return Region(means, scales, rotation_matrices(torch.from_numpy(rng.normal(size=(n, 4)))).numpy())
+    return Region(
+        means, scales, rotation_matrices(torch.from_numpy(rng.normal(size=(n, 4)))).numpy()
+    )
 
 
 def lattice(*counts: int) -> np.ndarray:
@@ -46,12 +49,21 @@ def upright(means: np.ndarray, scale: float = 0.3) -> Region:
     return Region(means, np.full(means.shape, scale), np.tile(np.eye(3), (len(means), 1, 1)))
 
 
-def ours(region: Region, dtype: torch.dtype = torch.float32, pad: int = 0, **options: Any) -> np.ndarray:
-    """Our descriptor [n, J, D - 1]. Raises ValueError if a second run gives other bits, or padding is not zero."""
+def ours(
+    region: Region, dtype: torch.dtype = torch.float32, pad: int = 0, **options: Any
+) -> np.ndarray:
+    """Our descriptor [n, J, D - 1]. Raises ValueError if a second run gives other bits, or padding
+    is not zero.
+    """
     n = len(region.means)
-    padded = [torch.from_numpy(np.concatenate([v, np.full((pad, *v.shape[1:]), 7.0)]))[None] for v in region]
+    padded = [
+        torch.from_numpy(np.concatenate([v, np.full((pad, *v.shape[1:]), 7.0)]))[None]
+        for v in region
+    ]
     mask = torch.arange(n + pad)[None] < n
-    found, again = (describe(*padded, mask, Descriptor(**options), dtype=dtype).values[0] for _ in range(2))
+    found, again = (
+        describe(*padded, mask, Descriptor(**options), dtype=dtype).values[0] for _ in range(2)
+    )
     if not torch.equal(found, again):
         raise ValueError("a second run gives other bits, or NaN")
     if not (found[n:] == 0).all():
@@ -59,13 +71,18 @@ def ours(region: Region, dtype: torch.dtype = torch.float32, pad: int = 0, **opt
     return found[:n].detach().double().numpy()
 
 
-def compare(region: Region, pad: int = 0, tolerance_64: float = TOLERANCE_64, **options: Any) -> Outcome:
-    """Ours, in two orders of the Gaussians, against 60 digits. Raises ValueError if float64 misses its tolerance."""
+def compare(
+    region: Region, pad: int = 0, tolerance_64: float = TOLERANCE_64, **options: Any
+) -> Outcome:
+    """Ours, in two orders of the Gaussians, against 60 digits. Raises ValueError if float64 misses
+    its tolerance.
+    """
     exact = oracle.describe(*region, **options)
     order = np.random.default_rng(2).permutation(len(region.means))
     shuffled = Region(*(v[order] for v in region))
     error = max(
-        relative(ours(region, pad=pad, **options), exact), relative(ours(shuffled, pad=pad, **options), exact[order])
+        relative(ours(region, pad=pad, **options), exact),
+        relative(ours(shuffled, pad=pad, **options), exact[order]),
     )
     double = relative(ours(region, torch.float64, pad=pad, **options), exact)
     if not double <= tolerance_64:
@@ -120,9 +137,13 @@ SYMMETRIC: dict[str, Callable[[], Region]] = {  # eigenspaces of many dimensions
     "collinear and round": lambda: upright(lattice(16, 1, 1)),
     "coplanar": lambda: cloud()._replace(means=cloud().means * [1, 1, 0]),
     "square lattice": lambda: upright(lattice(5, 5, 1)),
-    "square lattice of pancakes": lambda: upright(lattice(5, 5, 1))._replace(scales=np.tile([0.4, 0.4, 0.01], (25, 1))),
+    "square lattice of pancakes": lambda: upright(lattice(5, 5, 1))._replace(
+        scales=np.tile([0.4, 0.4, 0.01], (25, 1))
+    ),
     "cubic lattice": lambda: upright(lattice(3, 3, 3)),
-    "ring": lambda: upright(np.stack([f(np.arange(16) * np.pi / 8) for f in (np.cos, np.sin, np.zeros_like)], -1)),
+    "ring": lambda: upright(
+        np.stack([f(np.arange(16) * np.pi / 8) for f in (np.cos, np.sin, np.zeros_like)], -1)
+    ),
 }
 REGIONS: dict[str, Callable[[], Region]] = {
     **{name: partial(stretched, change) for name, change in STRETCHES.items()},
@@ -137,13 +158,18 @@ REGIONS: dict[str, Callable[[], Region]] = {
 
 @case("{name}", name=REGIONS)
 def extreme(name: str) -> Outcome:
-    # The axis of far clusters is parted from the next by 1e-7 of the variance, so float64 knows it to 1e-9 only.
-    return compare(REGIONS[name](), tolerance_64=1e-9 if name == "two far clusters" else TOLERANCE_64)
+    # The axis of far clusters is parted from the next by 1e-7 of the variance, so float64 knows it
+    # to 1e-9 only.
+    return compare(
+        REGIONS[name](), tolerance_64=1e-9 if name == "two far clusters" else TOLERANCE_64
+    )
 
 
 @case("an edge of 1e-200")
 def faint_edge() -> Outcome:
-    region = Region(np.array([[-1.0, 0, 0], [1.0, 0, 0]]), np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)))
+    region = Region(
+        np.array([[-1.0, 0, 0], [1.0, 0, 0]]), np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1))
+    )
     return compare(region, bandwidth=float(2 / np.sqrt(np.log(1e200))))
 
 
@@ -160,7 +186,11 @@ def anisotropies(anisotropy: float) -> Outcome:
     return compare(cloud(), anisotropy=anisotropy)
 
 
-@case("sigma {bandwidth:.0e}, a {anisotropy:.0e}, needles", bandwidth=[1e-6, 1e6], anisotropy=[1e-12, 1e12])
+@case(
+    "sigma {bandwidth:.0e}, a {anisotropy:.0e}, needles",
+    bandwidth=[1e-6, 1e6],
+    anisotropy=[1e-12, 1e12],
+)
 def both(bandwidth: float, anisotropy: float) -> Outcome:
     region = cloud()
     region = region._replace(scales=region.scales * [1e6, 1, 1])
@@ -180,7 +210,9 @@ def padded(n: int) -> Outcome:
 
 @case("one {bad} in the {field}", bad=[np.nan, np.inf], field=Region._fields)
 def one_broken(bad: float, field: str) -> Outcome:
-    """The row is zero, its neighbours are as if it were not there, and the region beside it keeps every bit."""
+    """The row is zero, its neighbours are as if it were not there, and the region beside it keeps
+    every bit.
+    """
     clean, other, rest = cloud(), cloud(seed=1), np.delete(np.arange(16), 5)
     broken = Region(*(v.copy() for v in clean))
     getattr(broken, field)[5].flat[1] = bad
@@ -202,7 +234,10 @@ def all_broken() -> Outcome:
 # gradients
 
 
-@case("gradient on {name}", name=["square lattice", "cubic lattice", "coincident and round", "collinear", "far pairs"])
+@case(
+    "gradient on {name}",
+    name=["square lattice", "cubic lattice", "coincident and round", "collinear", "far pairs"],
+)
 def gradient(name: str) -> Outcome:
     """Share of gradient entries that are not finite."""
     means, *rest = (torch.from_numpy(v)[None] for v in REGIONS[name]())

@@ -30,7 +30,11 @@ class Photos(NamedTuple):
 
 
 def photos(
-    stops: np.ndarray | float = 0.0, unit: float = 1.0, shift: float = 0.0, n: int = N, views: int = VIEWS
+    stops: np.ndarray | float = 0.0,
+    unit: float = 1.0,
+    shift: float = 0.0,
+    n: int = N,
+    views: int = VIEWS,
 ) -> Photos:
     """A wall of broad stripes at z = 3, from places side by side; stops [V, 3]."""
     exact = np.broadcast_to(stops, (views, 3)) - np.broadcast_to(stops, (views, 3)).mean(0)
@@ -40,7 +44,11 @@ def photos(
         place = 2 * view  # pixels
         light = 0.12 + 0.05 * np.sin((x + place) / 9.0 + np.arange(3)) + np.zeros((HEIGHT, 1, 1))
         lit = np.minimum(light * 2.0**of, 1)
-        images.append((255 * np.where(lit <= 0.0031308, 12.92 * lit, 1.055 * lit ** (1 / 2.4) - 0.055)).round())
+        images.append(
+            (
+                255 * np.where(lit <= 0.0031308, 12.92 * lit, 1.055 * lit ** (1 / 2.4) - 0.055)
+            ).round()
+        )
         poses[view, :3, 3] = -unit * np.array([place * 3 / 70, 0, 0]) - shift
     points = np.column_stack([rng.uniform(-1, 1.6, n), rng.uniform(-0.8, 0.8, n), np.full(n, 3.0)])
     return Photos(np.array(images, np.uint8), poses, unit * points + shift, exact)
@@ -118,7 +126,11 @@ OWN: dict[str, Callable[[], tuple[np.ndarray, np.ndarray, np.ndarray]]] = {
     "a drift, units of 1e+12": lambda: (DRIFT, path(unit=1e12), 0 * DRIFT),
     "two views": lambda: (DRIFT[:2], path(2), 0 * DRIFT[:2]),
     "no view known": lambda: (DRIFT + np.nan, path(), 0 * DRIFT),
-    "half of the views known": lambda: (DRIFT * np.where(np.arange(24) % 2, 1, np.nan)[:, None], path(), 0 * DRIFT),
+    "half of the views known": lambda: (
+        DRIFT * np.where(np.arange(24) % 2, 1, np.nan)[:, None],
+        path(),
+        0 * DRIFT,
+    ),
 }
 
 
@@ -128,10 +140,14 @@ def own(name: str) -> Outcome:
     exposures, poses, exact = OWN[name]()
 
     def differs(found: np.ndarray, exact: np.ndarray) -> float:
-        worst = float(np.abs(found - exact).max()) / (float(np.nanmax(np.abs(exposures), initial=0)) or 1)
+        worst = float(np.abs(found - exact).max()) / (
+            float(np.nanmax(np.abs(exposures), initial=0)) or 1
+        )
         return worst if np.isfinite(found).all() else float("inf")
 
-    return beside(own_part(exposures, poses), lambda: exposures - exposures.mean(0), exact, 0.02, differs)
+    return beside(
+        own_part(exposures, poses), lambda: exposures - exposures.mean(0), exact, 0.02, differs
+    )
 
 
 @case("what is a photo's own, views at one place, {size:.0e} stops", size=[1e-6, 1.0, 1e6])

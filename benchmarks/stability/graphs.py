@@ -53,9 +53,13 @@ def session(attends: bool, size: float) -> tuple[Any, np.ndarray]:
 def answered(of: PointInputs, attends: bool, size: float = 1.0) -> Outcome:
     runner, answers = session(attends, size)
     given = cloud_of(of)._asdict()
-    found = runner.run(None, {entry.name: given[entry.name].numpy() for entry in runner.get_inputs()})[0]
+    found = runner.run(
+        None, {entry.name: given[entry.name].numpy() for entry in runner.get_inputs()}
+    )[0]
     exact = encoded(of, torch.float64, attends) @ answers.astype(np.float64)
-    return beside(found, lambda: encoded(filled(of), torch.float32, attends) @ answers, exact, ANSWERS)
+    return beside(
+        found, lambda: encoded(filled(of), torch.float32, attends) @ answers, exact, ANSWERS
+    )
 
 
 @case("{kind}, {name}", kind=["attention", "the largest"], name=INPUTS)

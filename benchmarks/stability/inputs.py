@@ -41,7 +41,12 @@ def cloud(n: int = N) -> Cloud:
     means[wall, 0], means[~wall, 2] = 0, 0
     normals = np.where(wall[:, None], (1.0, 0, 0), (0, 0, 1.0))
     sizes = 1e-3 * rng.uniform(1, 2, (n, 1, 1))
-    return Cloud(means, normals, sizes * (np.eye(3) - 0.9 * normals[:, :, None] * normals[:, None]), np.eye(3)[2])
+    return Cloud(
+        means,
+        normals,
+        sizes * (np.eye(3) - 0.9 * normals[:, :, None] * normals[:, None]),
+        np.eye(3)[2],
+    )
 
 
 def placed(unit: float = 1.0, shift: Any = 0.0) -> Cloud:
@@ -105,11 +110,15 @@ FEW: dict[str, Callable[[], Cloud]] = {
     "points in one place": lambda: cloud()._replace(means=cloud().means * 0 + 5),
     "points on a line": lambda: cloud()._replace(means=cloud().means * [0, 1, 0]),
     "pairs": lambda: cloud()._replace(means=np.repeat(cloud().means[::2], 2, 0)),
-    "an outlier at 1e+09": lambda: cloud()._replace(means=np.where(np.arange(N)[:, None] == 7, 1e9, cloud().means)),
+    "an outlier at 1e+09": lambda: cloud()._replace(
+        means=np.where(np.arange(N)[:, None] == 7, 1e9, cloud().means)
+    ),
     "covariances of 0": lambda: cloud()._replace(covariances=0 * cloud().covariances),
     "covariances of 1e-30": lambda: cloud()._replace(covariances=1e-30 * cloud().covariances),
     "covariances of 1e+30": lambda: cloud()._replace(covariances=1e30 * cloud().covariances),
-    "covariances of rank 1": lambda: cloud()._replace(covariances=np.tile(np.diag([1e-3, 0, 0]), (N, 1, 1))),
+    "covariances of rank 1": lambda: cloud()._replace(
+        covariances=np.tile(np.diag([1e-3, 0, 0]), (N, 1, 1))
+    ),
 }
 
 
@@ -141,7 +150,14 @@ def own(name: str) -> Outcome:
 def encoder(attends: bool = True) -> PointEncoder:
     """With weights as they begin, inputs standardised as in a room."""
     torch.manual_seed(0)
-    made = PointEncoder(4, seen(cloud(1)).descriptors.shape[1], n_components=16, width=16, hidden=16, attends=attends)
+    made = PointEncoder(
+        4,
+        seen(cloud(1)).descriptors.shape[1],
+        n_components=16,
+        width=16,
+        hidden=16,
+        attends=attends,
+    )
     made.norm_own.deviation[:] = 0.5
     made.components.normal_(0, 0.1)
     return made.eval()
@@ -154,24 +170,35 @@ def encoded(of: PointInputs, dtype: torch.dtype, attends: bool = True) -> np.nda
     made, given = encoder(attends).to(dtype), cloud_of(of)
     given = type(given)(*(part.to(dtype) for part in given[:4]), given.neighbors)
     with torch.no_grad():
-        found = made(given, made.embedded(given.own, given.descriptors), torch.arange(len(given.own)), given.neighbors)
+        found = made(
+            given,
+            made.embedded(given.own, given.descriptors),
+            torch.arange(len(given.own)),
+            given.neighbors,
+        )
     return found.numpy()
 
 
 def spoiled(change: Callable[[PointInputs], dict[str, np.ndarray]]) -> PointInputs:
     of = seen(cloud(60))
-    return of._replace(**{name: values.astype(getattr(of, name).dtype) for name, values in change(of).items()})
+    return of._replace(
+        **{name: values.astype(getattr(of, name).dtype) for name, values in change(of).items()}
+    )
 
 
 def filled(of: PointInputs) -> PointInputs:
-    """Inputs in which nobody is missing: the first point takes everybody's place who is not there."""
+    """Inputs in which nobody is missing: the first point takes everybody's place who is not
+    there.
+    """
     return of._replace(neighbors=np.maximum(of.neighbors, 0))
 
 
 ENCODE: dict[str, Callable[[], PointInputs]] = {
     "nobody near": lambda: spoiled(lambda of: {"neighbors": of.neighbors * 0 - 1}),
     "everybody in one place": lambda: spoiled(lambda of: {"means": of.means * 0}),
-    "the same neighbour twelve times": lambda: spoiled(lambda of: {"neighbors": of.neighbors[:, :, :1].repeat(12, 2)}),
+    "the same neighbour twelve times": lambda: spoiled(
+        lambda of: {"neighbors": of.neighbors[:, :, :1].repeat(12, 2)}
+    ),
     "own inputs of 1e+30": lambda: spoiled(lambda of: {"own": 1e30 * of.own}),
     "descriptors of 1e+30": lambda: spoiled(lambda of: {"descriptors": 1e30 * of.descriptors}),
     "descriptors of 0": lambda: spoiled(lambda of: {"descriptors": 0 * of.descriptors}),
@@ -191,10 +218,18 @@ def encodes(name: str) -> Outcome:
     def both(of: PointInputs, dtype: torch.dtype) -> np.ndarray:
         return np.stack([encoded(of, dtype, attends) for attends in (True, False)])
 
-    return beside(both(of, torch.float32), lambda: both(filled(of), torch.float32), both(of, torch.float64), ENCODED)
+    return beside(
+        both(of, torch.float32),
+        lambda: both(filled(of), torch.float32),
+        both(of, torch.float64),
+        ENCODED,
+    )
 
 
-@case("encoded, {name}", name=["neighbours in another order", "neighbours padded", "points in another order"])
+@case(
+    "encoded, {name}",
+    name=["neighbours in another order", "neighbours padded", "points in another order"],
+)
 def reordered(name: str) -> Outcome:
     """As before, point by point."""
     of = seen(cloud(60))
@@ -205,7 +240,9 @@ def reordered(name: str) -> Outcome:
         neighbors = np.where(of.neighbors >= 0, inverse[of.neighbors], -1)[rows]
         other = PointInputs(*(part[rows] for part in of[:4]), neighbors)
     elif "padded" in name:
-        other = of._replace(neighbors=np.concatenate([of.neighbors, np.full_like(of.neighbors, -1)], 2))
+        other = of._replace(
+            neighbors=np.concatenate([of.neighbors, np.full_like(of.neighbors, -1)], 2)
+        )
     else:
         other = of._replace(neighbors=np.ascontiguousarray(of.neighbors[:, :, ::-1]))
     return Outcome(relative(encoded(other, torch.float32), exact[rows]), ENCODED)

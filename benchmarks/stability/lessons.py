@@ -14,7 +14,18 @@ import numpy as np
 
 from benchmarks.stability.case import Outcome, beside, case
 from chebsplat.lifting.averages import averaged
-from chebsplat.shape.lessons import RIDGE, Sums, basis, combined, novelty, odds, scale_of, solved, summed, unexplained
+from chebsplat.shape.lessons import (
+    RIDGE,
+    Sums,
+    basis,
+    combined,
+    novelty,
+    odds,
+    scale_of,
+    solved,
+    summed,
+    unexplained,
+)
 
 N, P, C = 40, 6, 3
 ANSWERS = 1e-9  # of float64 sums and a Cholesky of condition 1e3 and less
@@ -32,7 +43,11 @@ def scene(seed: int = 0, n: int = N) -> Scene:
     rng = np.random.default_rng(seed)
     features = rng.normal(size=(n, P))
     features[:, -1] = 1
-    return Scene(features, features @ rng.normal(size=(P, C)) + 0.3 * rng.normal(size=(n, C)), rng.uniform(0.5, 2, n))
+    return Scene(
+        features,
+        features @ rng.normal(size=(P, C)) + 0.3 * rng.normal(size=(n, C)),
+        rng.uniform(0.5, 2, n),
+    )
 
 
 def with_features(change: Callable[[np.ndarray], np.ndarray]) -> Scene:
@@ -49,7 +64,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "fewer points than features": lambda: scene(n=3),
     "all points alike": lambda: Scene(*(np.repeat(part[:1], N, 0) for part in scene())),
     "two features alike": lambda: with_features(lambda z: z[:, [0, 0, 1, 2, 3]]),
-    "two features alike to 1e-12": lambda: with_features(lambda z: z[:, [0, 0, 1, 2, 3]] * (1 + 1e-12 * z)),
+    "two features alike to 1e-12": lambda: with_features(
+        lambda z: z[:, [0, 0, 1, 2, 3]] * (1 + 1e-12 * z)
+    ),
     "a feature that is 0": lambda: with_features(lambda z: z * [1, 0, 1, 1, 1]),
     "features of 1e-3 to 1e+2": lambda: with_features(lambda z: z * np.geomspace(1e-3, 1e2, 5)),
     "features of 1e+05": lambda: with_features(lambda z: z * 1e5),
@@ -65,7 +82,10 @@ SCENES: dict[str, Callable[[], Scene]] = {
 def exactly(of: Scene) -> np.ndarray:
     """Answers of the scene's own points in 60 digits, straight from the definition."""
     with mpmath.workdps(60):
-        z, y, w = (mpmath.matrix(np.asarray(part, np.float64).reshape(len(of.weights), -1).tolist()) for part in of)
+        z, y, w = (
+            mpmath.matrix(np.asarray(part, np.float64).reshape(len(of.weights), -1).tolist())
+            for part in of
+        )
         total = mpmath.fsum(w)
         weighted = mpmath.matrix(len(of.weights), P)
         for i in range(len(of.weights)):
@@ -84,7 +104,9 @@ def learned(name: str) -> Outcome:
     def plainly() -> np.ndarray:
         z, y, w = (part.astype(np.float32) for part in of)
         gram = z.T @ (w[:, None] * z) / w.sum()
-        return z @ np.linalg.solve(gram + np.float32(RIDGE) * np.diag(np.diag(gram)), z.T @ (w[:, None] * y) / w.sum())
+        return z @ np.linalg.solve(
+            gram + np.float32(RIDGE) * np.diag(np.diag(gram)), z.T @ (w[:, None] * y) / w.sum()
+        )
 
     return beside(of.features @ solved(summed(*of), RIDGE), plainly, exactly(of), ANSWERS)
 
@@ -108,13 +130,22 @@ def lessons(count: int) -> list[Sums]:
 @case("{count} lessons in any order", count=[2, 1000])
 def order(count: int) -> Outcome:
     """W of lessons of weights 1e-15 to 1e15 forwards beside that backwards."""
-    weights, sums = list(np.geomspace(1e-15, 1e15, count)), lessons(min(count, 20)) * max(count // 20, 1)
+    weights, sums = (
+        list(np.geomspace(1e-15, 1e15, count)),
+        lessons(min(count, 20)) * max(count // 20, 1),
+    )
     weights = weights[: len(sums)]
-    found, again = (solved(combined(of, by), RIDGE) for of, by in ((sums, weights), (sums[::-1], weights[::-1])))
+    found, again = (
+        solved(combined(of, by), RIDGE) for of, by in ((sums, weights), (sums[::-1], weights[::-1]))
+    )
 
     def plainly() -> np.ndarray:
-        gram = sum(np.float32(w) * of.gram.astype(np.float32) for of, w in zip(sums, weights, strict=True))
-        cross = sum(np.float32(w) * of.cross.astype(np.float32) for of, w in zip(sums, weights, strict=True))
+        gram = sum(
+            np.float32(w) * of.gram.astype(np.float32) for of, w in zip(sums, weights, strict=True)
+        )
+        cross = sum(
+            np.float32(w) * of.cross.astype(np.float32) for of, w in zip(sums, weights, strict=True)
+        )
         return np.linalg.solve(gram + np.float32(RIDGE) * np.diag(np.diag(gram)), cross)
 
     return beside(found, plainly, again, ANSWERS)
@@ -176,7 +207,9 @@ def views(unit: float = 1.0, shift: float = 0.0, size: float = 1.0) -> Views:
     """A wall at z = 2 from places side by side, features f16 as teachers' are kept."""
     rng, poses = np.random.default_rng(4), np.tile(np.eye(4), (3, 1, 1))
     poses[:, :3, 3] = -unit * np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]) - shift
-    points = np.column_stack([rng.uniform(-0.8, 0.9, N), rng.uniform(-0.7, 0.7, N), np.full(N, 2.0)])
+    points = np.column_stack(
+        [rng.uniform(-0.8, 0.9, N), rng.uniform(-0.7, 0.7, N), np.full(N, 2.0)]
+    )
     features = (size * rng.uniform(0.25, 1, (3, 24, 32, C))).astype(np.float16)
     return Views(unit * points + shift, np.full((3, 24, 32), unit * 2.0), features, poses, unit)
 
@@ -223,7 +256,9 @@ def seen(name: str) -> Outcome:
             if abs(depth[row, column] / of.unit - z) < 0.03 + 0.01 * z and said.any():
                 rows.append(said / np.linalg.norm(said))
         exact[i] = np.mean(rows, 0) if rows else 0
-    found, _ = averaged(of.means, of.depth, of.features, C, np.tile(VIEW_K, (3, 1, 1)), of.poses, unit=of.unit)
+    found, _ = averaged(
+        of.means, of.depth, of.features, C, np.tile(VIEW_K, (3, 1, 1)), of.poses, unit=of.unit
+    )
     return beside(found, lambda: plain, exact, 1e-5)
 
 

@@ -62,15 +62,27 @@ def of_a_view(name: str) -> Outcome:
     means, quats, scales, opacities, _ = (part.numpy() for part in gaussians().values())
     pose = np.eye(4)
     pose[:3, 3] = -shift
-    parts = (unit * means + shift).astype(np.float32), quats, (unit * scales).astype(np.float32), opacities
+    parts = (
+        (unit * means + shift).astype(np.float32),
+        quats,
+        (unit * scales).astype(np.float32),
+        opacities,
+    )
     camera = pose, K.double().numpy(), (WIDTH, HEIGHT)
     found = lift.lift(parts, *camera, values, counts)
-    ours, (weights, sums) = np.zeros((len(means), CHANNELS + 1)), reference.lift(parts, *camera, values, counts)
+    ours, (weights, sums) = (
+        np.zeros((len(means), CHANNELS + 1)),
+        reference.lift(parts, *camera, values, counts),
+    )
     ours[found.ids] = np.column_stack([found.weights, found.sums])
     heard = weights > 1e-2 * weights.max()
 
     def plainly() -> np.ndarray:
-        by_cell = reference.pixel_weights(parts, *camera).reshape(CELLS[0], 4, CELLS[1], 4, -1).sum((1, 3))
+        by_cell = (
+            reference.pixel_weights(parts, *camera)
+            .reshape(CELLS[0], 4, CELLS[1], 4, -1)
+            .sum((1, 3))
+        )
         w = by_cell[..., heard].astype(np.float32) * counts[..., None]
         return np.einsum("yxn,yxc->nc", w, values) / w.sum((0, 1))[:, None]
 
@@ -85,9 +97,18 @@ def of_a_view(name: str) -> Outcome:
 SAID: dict[str, Callable[[np.ndarray, np.ndarray], object]] = {
     "as it is": lambda values, counts: None,
     "half NaN": lambda values, counts: values[::2, 1:].fill(np.nan),
-    "half infinite, half counts nothing": lambda values, counts: (values[::2].fill(np.inf), counts[1::2].fill(0)),
-    "half zero, counts of 1e-30": lambda values, counts: (values[:, ::2].fill(0), counts.__imul__(1e-30)),
-    "values and counts of 1e+15": lambda values, counts: (values.__imul__(1e15), counts.__imul__(1e15)),
+    "half infinite, half counts nothing": lambda values, counts: (
+        values[::2].fill(np.inf),
+        counts[1::2].fill(0),
+    ),
+    "half zero, counts of 1e-30": lambda values, counts: (
+        values[:, ::2].fill(0),
+        counts.__imul__(1e-30),
+    ),
+    "values and counts of 1e+15": lambda values, counts: (
+        values.__imul__(1e15),
+        counts.__imul__(1e15),
+    ),
 }
 
 
@@ -98,11 +119,15 @@ def cells(size: tuple[int, int], name: str) -> Outcome:
     middle.
     """
     rng = np.random.default_rng(3)
-    values, counts = rng.normal(size=(*size, CHANNELS)).astype(np.float32), rng.uniform(1, 2, size).astype(np.float32)
+    values, counts = (
+        rng.normal(size=(*size, CHANNELS)).astype(np.float32),
+        rng.uniform(1, 2, size).astype(np.float32),
+    )
     SAID[name](values, counts)
     told = np.isfinite(values).all(-1) & values.any(-1)
     rows, columns = (
-        np.arange(np.lcm(pixels, n)) * n // np.lcm(pixels, n) for pixels, n in zip((HEIGHT, WIDTH), size, strict=True)
+        np.arange(np.lcm(pixels, n)) * n // np.lcm(pixels, n)
+        for pixels, n in zip((HEIGHT, WIDTH), size, strict=True)
     )
     weights = np.where(told, counts, 0).astype(np.float64)[np.ix_(rows, columns)]
     pieces = np.where(told[..., None], values, 0).astype(np.float64)[np.ix_(rows, columns)]
@@ -112,7 +137,9 @@ def cells(size: tuple[int, int], name: str) -> Outcome:
     exact = sums / np.where(share > 0, share, 1)[..., None], share
 
     def plainly() -> tuple[np.ndarray, np.ndarray]:
-        index = np.ix_(*((np.arange(n) * 2 + 1) * m // (2 * n) for n, m in zip(CELLS, size, strict=True)))
+        index = np.ix_(
+            *((np.arange(n) * 2 + 1) * m // (2 * n) for n, m in zip(CELLS, size, strict=True))
+        )
         return values[index], counts[index]
 
     def apart(found: tuple[np.ndarray, ...], exact: tuple[np.ndarray, ...]) -> float:
@@ -131,8 +158,14 @@ class Votes(NamedTuple):
 
 def votes(n_views: int = 7, size: Any = 1.0, weight: Any = 1.0) -> Votes:
     rng = np.random.default_rng(1)
-    weights, means = rng.uniform(0.5, 2, (12, n_views)), rng.normal(size=(12, n_views, CHANNELS)) + 1
-    return Votes((weight * weights).astype(np.float32), (np.asarray(size)[..., None] * means).astype(np.float32))
+    weights, means = (
+        rng.uniform(0.5, 2, (12, n_views)),
+        rng.normal(size=(12, n_views, CHANNELS)) + 1,
+    )
+    return Votes(
+        (weight * weights).astype(np.float32),
+        (np.asarray(size)[..., None] * means).astype(np.float32),
+    )
 
 
 def one_against(n_views: int = 7) -> Votes:
@@ -145,7 +178,9 @@ def one_against(n_views: int = 7) -> Votes:
 
 ESTIMATES: dict[str, Callable[[], Votes]] = {
     "one view": lambda: votes(1),
-    "views that say the same": lambda: Votes(votes().weights, np.repeat(votes().means[:, :1], 7, 1)),
+    "views that say the same": lambda: Votes(
+        votes().weights, np.repeat(votes().means[:, :1], 7, 1)
+    ),
     "one view against six": one_against,
     "2000 views": lambda: votes(2000),
     "votes of 1e-20": lambda: votes(size=1e-20),
@@ -168,7 +203,10 @@ def median(of: Votes, dtype: type, floor: float) -> np.ndarray:
     factors = w
     for _ in range(STEPS):
         toward = (factors[..., None] * directions).sum(1)
-        cosines = np.einsum("gvc,gc->gv", directions, toward) / np.sqrt((toward * toward).sum(-1))[:, None]
+        cosines = (
+            np.einsum("gvc,gc->gv", directions, toward)
+            / np.sqrt((toward * toward).sum(-1))[:, None]
+        )
         factors = w / np.maximum(np.sqrt(np.maximum(2 - 2 * cosines, 0)), floor)
     return np.asarray((factors[..., None] * b).sum(1) / factors.sum(1)[:, None])
 
@@ -181,6 +219,10 @@ def estimates(name: str) -> Outcome:
     of = ESTIMATES[name]()
     n, n_views = of.weights.shape
     rows = np.tile(np.arange(n_views, dtype=np.int32), n)
-    given = Observations(np.arange(n + 1) * n_views, rows, of.weights.ravel(), of.means.reshape(-1, CHANNELS))
+    given = Observations(
+        np.arange(n + 1) * n_views, rows, of.weights.ravel(), of.means.reshape(-1, CHANNELS)
+    )
     exact = median(of, np.longdouble, NEAREST)
-    return beside(estimate(given, STEPS).features, lambda: median(of, np.float32, 0.0), exact, VOTES)
+    return beside(
+        estimate(given, STEPS).features, lambda: median(of, np.float32, 0.0), exact, VOTES
+    )

@@ -17,7 +17,8 @@ from chebsplat.training.losses import feature_distance, feature_distance_referen
 from chebsplat.views import TaughtLabels
 
 HEIGHT, WIDTH, CHANNELS, CLASSES = 8, 12, 5, 4
-TOLERANCE = 1e-5  # logits of 10 are rounded by 1e-6, and a gradient is a difference of two of their exponentials
+# logits of 10 are rounded by 1e-6, and a gradient is a difference of two of their exponentials
+TOLERANCE = 1e-5
 
 
 def normal(*shape: int, seed: int = 0) -> Tensor:
@@ -33,7 +34,9 @@ class Seen(NamedTuple):
     mask: Tensor | None = None
 
 
-def seen(size: float = 1.0, n_classes: int = CLASSES, confidence: float = 1.0, unlabelled: bool = False) -> Seen:
+def seen(
+    size: float = 1.0, n_classes: int = CLASSES, confidence: float = 1.0, unlabelled: bool = False
+) -> Seen:
     g = torch.Generator().manual_seed(1)
     classes = torch.randint(n_classes, (HEIGHT // 2, WIDTH // 2), generator=g)
     certainty = confidence * torch.rand(classes.shape, generator=g)
@@ -63,12 +66,20 @@ def exact_entropy(view: Seen) -> float:
     labels, terms = view.labels, []
     with mpmath.workdps(60):
         for i, j in (labels.classes >= 0).nonzero().tolist():
-            cell = view.render[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].reshape(4, -1).double().tolist()
+            cell = (
+                view.render[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].reshape(4, -1).double().tolist()
+            )
             mean = [mpmath.fsum(column) / 4 for column in zip(*cell, strict=True)]
-            logits = [mpmath.fdot(mean, code) / view.temperature for code in labels.class_codes.double().tolist()]
+            logits = [
+                mpmath.fdot(mean, code) / view.temperature
+                for code in labels.class_codes.double().tolist()
+            ]
             highest = max(logits)
             total = mpmath.log(mpmath.fsum(mpmath.exp(logit - highest) for logit in logits))
-            terms.append(labels.confidence[i, j].item() * (highest + total - logits[int(labels.classes[i, j])]))
+            terms.append(
+                labels.confidence[i, j].item()
+                * (highest + total - logits[int(labels.classes[i, j])])
+            )
         return float(mpmath.fsum(terms) / max(len(terms), 1))
 
 
@@ -81,7 +92,9 @@ def gradient(loss: Tensor, render: Tensor) -> Tensor:
 def cross_entropy(name: str) -> Outcome:
     """The loss against 60 digits, its gradient against float64."""
     view = VIEWS[name]()
-    render, double = (view.render.to(kind).requires_grad_(True) for kind in (torch.float32, torch.float64))
+    render, double = (
+        view.render.to(kind).requires_grad_(True) for kind in (torch.float32, torch.float64)
+    )
     loss = label_entropy(render, view.labels, view.mask, view.temperature)
     slope = gradient(loss, render)
     exact = gradient(label_entropy(double, view.labels, view.mask, view.temperature), double)
@@ -89,12 +102,22 @@ def cross_entropy(name: str) -> Outcome:
     return Outcome(error, TOLERANCE)
 
 
-@case("L1 of features {size:.0e} to {target:.0e}", size=[0.0, 1e-20, 1e20], target=[0.0, 1e-20, 1e20])
+@case(
+    "L1 of features {size:.0e} to {target:.0e}", size=[0.0, 1e-20, 1e20], target=[0.0, 1e-20, 1e20]
+)
 def feature_l1(size: float, target: float) -> Outcome:
     """The fused loss against float64 in plain torch."""
     features = target * normal(HEIGHT // 2, WIDTH // 2, CHANNELS, seed=3)
     drawn = size * normal(HEIGHT, WIDTH, CHANNELS)
-    render, double = (drawn.to(kind).requires_grad_(True) for kind in (torch.float32, torch.float64))
-    loss, exact = feature_distance(render, features, kind="l1"), feature_distance_reference(double, features, kind="l1")
-    error = max(relative(loss.detach(), exact.detach()), relative(gradient(loss, render), gradient(exact, double)))
+    render, double = (
+        drawn.to(kind).requires_grad_(True) for kind in (torch.float32, torch.float64)
+    )
+    loss, exact = (
+        feature_distance(render, features, kind="l1"),
+        feature_distance_reference(double, features, kind="l1"),
+    )
+    error = max(
+        relative(loss.detach(), exact.detach()),
+        relative(gradient(loss, render), gradient(exact, double)),
+    )
     return Outcome(error, TOLERANCE)

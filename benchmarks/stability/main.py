@@ -1,4 +1,6 @@
-"""Every stiff and extreme case of the maths: the plain way's error, ours beside its tolerance, pass or fail."""
+"""Every stiff and extreme case of the maths: the plain way's error, ours beside its tolerance, pass
+or fail.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,8 @@ def main(arguments: Sequence[str]) -> int:
         verdict = "pass" if row.passed else f"FAIL  {row.note}"
         naive = "" if math.isnan(row.naive) else f"{row.naive:.1e}"
         print(
-            f"{row.module:<11} {row.case:<52} {naive:>8} | {row.error:8.1e} <= {row.tolerance:7.1e}  {verdict}",
+            f"{row.module:<11} {row.case:<52} {naive:>8} | {row.error:8.1e} <= "
+            f"{row.tolerance:7.1e}  {verdict}",
             flush=True,
         )
     path = options.out / "stability.csv"

@@ -74,7 +74,11 @@ def walls(name: str) -> Outcome:
         return (depth - np.float32(of[0].pose[2, 3])).astype(np.float32)
 
     def off(found: np.ndarray, exact: float) -> float:
-        return float(np.abs(found - exact).max() / (unit * VOXEL)) if np.isfinite(found).all() else float("inf")
+        return (
+            float(np.abs(found - exact).max() / (unit * VOXEL))
+            if np.isfinite(found).all()
+            else float("inf")
+        )
 
     return beside(made.vertices[:, 2], plainly, unit * WALL + shift, NEAR, off)
 
@@ -95,7 +99,11 @@ def empty(name: str) -> Outcome:
     return Outcome(float(len(made.vertices) + len(made.triangles)), 0.0)
 
 
-@case("edges of depth in units of {unit:.0e}, {hole} beside", unit=[1e-30, 1.0, 1e30], hole=[0.0, np.nan])
+@case(
+    "edges of depth in units of {unit:.0e}, {hole} beside",
+    unit=[1e-30, 1.0, 1e30],
+    hole=[0.0, np.nan],
+)
 def edges(unit: float, hole: float) -> Outcome:
     """Pixels that are kept of two walls, a step between them, a hole in one; the plain way takes a
     step in units.
@@ -115,11 +123,21 @@ def edges(unit: float, hole: float) -> Outcome:
 
 def ball(n: int = 40) -> Mesh:
     """A unit ball of long triangles."""
-    v, u = np.meshgrid(np.linspace(0, np.pi, n // 2), np.linspace(0, 2 * np.pi, n, endpoint=False), indexing="ij")
-    vertices = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], -1).reshape(-1, 3).astype(np.float32)
+    v, u = np.meshgrid(
+        np.linspace(0, np.pi, n // 2), np.linspace(0, 2 * np.pi, n, endpoint=False), indexing="ij"
+    )
+    vertices = (
+        np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], -1)
+        .reshape(-1, 3)
+        .astype(np.float32)
+    )
     index = np.arange(len(vertices)).reshape(n // 2, n)
     a, b, c, d = index[:-1], np.roll(index, -1, 1)[:-1], index[1:], np.roll(index, -1, 1)[1:]
-    triangles = np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3).astype(np.int32)
+    triangles = (
+        np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)])
+        .reshape(-1, 3)
+        .astype(np.int32)
+    )
     return Mesh(vertices, triangles, np.zeros((len(vertices), 3), np.uint8))
 
 

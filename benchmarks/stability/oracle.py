@@ -1,4 +1,6 @@
-"""The descriptor in 60 digits, straight from its definition: no logarithms, no shortcut of the recurrence."""
+"""The descriptor in 60 digits, straight from its definition: no logarithms, no shortcut of the
+recurrence.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,8 @@ import mpmath
 import numpy as np
 
 DIGITS = 60
-FIXED = 200  # bits after the point: matrices of bounded entries multiply as whole numbers, 20 times faster
+# bits after the point: matrices of bounded entries multiply as whole numbers, 20 times faster
+FIXED = 200
 
 _exact = np.frompyfunc(mpmath.mpf, 1, 1)
 _exp = np.frompyfunc(mpmath.exp, 1, 1)
@@ -25,7 +28,9 @@ def describe(
     anisotropy: float = 10.0,
     bandwidth: float = 0.7,
 ) -> np.ndarray:
-    """One region without padding, [n, 3], [n, 3], [n, 3, 3] -> [n, J, D - 1], rounded to float64 at the end."""
+    """One region without padding, [n, 3], [n, 3], [n, 3, 3] -> [n, J, D - 1], rounded to float64 at
+    the end.
+    """
     n = len(means)
     if n == 0:
         return np.zeros((0, n_angles, max_degree - 1))
@@ -37,7 +42,9 @@ def describe(
         typical = sorted(s.max(1))[(n - 1) // 2]
         # A typical scale of 0: what is larger than typical is infinitely larger.
         ratio = s / typical if typical else np.where(s > 0, mpmath.mpf(10) ** 300, mpmath.mpf(0))
-        factors = _sqrt(1 / (1 + mpmath.mpf(anisotropy) * ratio**2))[:, :, None] * R.transpose(0, 2, 1)
+        factors = _sqrt(1 / (1 + mpmath.mpf(anisotropy) * ratio**2))[:, :, None] * R.transpose(
+            0, 2, 1
+        )
         around, certainty = _axis(c, s, R)
         angles = [_diagonals(_similarity(c, factors, _rotation(around, j, n_angles), bandwidth), max_degree) * n
                   for j in range(n_angles)]  # fmt: skip
@@ -59,7 +66,11 @@ def _axis(c: Any, s: Any, R: Any) -> tuple[Any, Any]:
     order = sorted(range(3), key=lambda k: values[k])
     low, middle, high = (max(values[k], mpmath.mpf(0)) for k in order)
     total = low + middle + mpmath.mpf("1e-5") * high
-    t = ((middle - low) / total - mpmath.mpf("0.02")) / mpmath.mpf("0.08") if total else mpmath.mpf(0)
+    t = (
+        ((middle - low) / total - mpmath.mpf("0.02")) / mpmath.mpf("0.08")
+        if total
+        else mpmath.mpf(0)
+    )
     t = min(max(t, mpmath.mpf(0)), mpmath.mpf(1))
     return np.array([vectors[k, order[0]] for k in range(3)]), t * t * (3 - 2 * t)
 

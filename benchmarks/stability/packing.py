@@ -79,9 +79,15 @@ def scales(name: str) -> Outcome:
         return longest(eight_bits(of["log_scales"].clip(of["log_scales"].max() - np.float32(10.2))))
 
     def apart(found: np.ndarray, exact: np.ndarray) -> float:
-        return float(np.expm1(np.abs(found - exact)).max()) if np.isfinite(found).all() else float("inf")
+        return (
+            float(np.expm1(np.abs(found - exact)).max())
+            if np.isfinite(found).all()
+            else float("inf")
+        )
 
-    return beside(longest(unpack(pack(of))["log_scales"]), plainly, longest(of["log_scales"]), 0.04, apart)
+    return beside(
+        longest(unpack(pack(of))["log_scales"]), plainly, longest(of["log_scales"]), 0.04, apart
+    )
 
 
 PLACES: dict[str, tuple[Callable[[], Parameters], float]] = {
@@ -107,7 +113,11 @@ def places(name: str) -> Outcome:
         return kept(np.round((of["means"] - low) / step) * step + low)
 
     def apart(found: np.ndarray, exact: np.ndarray) -> float:
-        return float(np.abs(found.astype(float) - exact).max()) if np.isfinite(found).all() else float("inf")
+        return (
+            float(np.abs(found.astype(float) - exact).max())
+            if np.isfinite(found).all()
+            else float("inf")
+        )
 
     return beside(kept(unpack(pack(of))["means"]), plainly, kept(of["means"]), tolerance, apart)
 
@@ -143,7 +153,10 @@ def quaternions(length: float) -> Outcome:
     def angles(found: np.ndarray, exact: np.ndarray) -> float:
         if not np.isfinite(found).all():
             return float("inf")
-        a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (found.astype(float), exact.astype(float)))
+        a, b = (
+            v / np.linalg.norm(v, axis=1, keepdims=True)
+            for v in (found.astype(float), exact.astype(float))
+        )
         return float(2 * np.arccos(np.abs((a * b).sum(1)).clip(0, 1)).max())
 
     def plainly() -> np.ndarray:
@@ -154,7 +167,9 @@ def quaternions(length: float) -> Outcome:
 
 
 SHOWN: dict[str, Callable[[], Parameters]] = {
-    "opacity logits of 1e+04": lambda: room(logit_opacities=lambda v: np.copyto(v, np.where(v > 0, 1e4, -1e4))),
+    "opacity logits of 1e+04": lambda: room(
+        logit_opacities=lambda v: np.copyto(v, np.where(v > 0, 1e4, -1e4))
+    ),
     "one logit of 1e+30": lambda: room(logit_opacities=odd(1e30)),
     "one colour of 1e+30": lambda: room(sh0=odd(1e30)),
     "one colour of -1e+30": lambda: room(sh0=odd(-1e30)),
@@ -171,7 +186,9 @@ def shown(name: str) -> Outcome:
 
     def pixels(logits: np.ndarray, sh0: np.ndarray) -> np.ndarray:
         opacity = 1 / (1 + np.exp(-logits.astype(np.float64).clip(-700, 700)))
-        return np.column_stack([others(opacity), others(sh0[:, 0].astype(float) * C0 + 0.5).clip(0, 1)])
+        return np.column_stack(
+            [others(opacity), others(sh0[:, 0].astype(float) * C0 + 0.5).clip(0, 1)]
+        )
 
     found = unpack(pack(of))
     given = of["logit_opacities"], of["sh0"]
@@ -198,7 +215,10 @@ def files(name: str) -> Outcome:
     coordinates as float32.
     """
     origin, scale = WORLDS[name]
-    of, world = room() | {"degrees": np.full(N, 3, np.uint8)}, World((origin, -origin, origin), scale)
+    of, world = (
+        room() | {"degrees": np.full(N, 3, np.uint8)},
+        World((origin, -origin, origin), scale),
+    )
     with tempfile.TemporaryDirectory() as folder:
         write_ply(Path(folder) / "room.ply", of, 3, world=world)
         found, _, _ = read_ply(Path(folder) / "room.ply", world)

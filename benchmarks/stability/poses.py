@@ -48,7 +48,9 @@ def worlds(
     """Cameras that look everywhere, `at` so far from the first world's origin."""
     rng, found = np.random.default_rng(0), np.tile(np.eye(4), (n, 1, 1))
     found[:, :3, :3] = Rotation.random(n, rng=rng).as_matrix()
-    found[:, :3, 3] = -np.einsum("vij,vj->vi", found[:, :3, :3], rng.normal(size=(n, 3)) * spread + at)
+    found[:, :3, 3] = -np.einsum(
+        "vij,vj->vi", found[:, :3, :3], rng.normal(size=(n, 3)) * spread + at
+    )
     way = Similarity(scale, TURN, np.array([1.0, -2.0, 0.5]) * shift)
     return Worlds(found, way.of_cameras(found), way)
 
@@ -85,7 +87,9 @@ def differ(found: Similarity, of: Worlds) -> float:
     there = centers(of.given)
     spread = max(float(np.abs(there - there.mean(0)).max()), 1e-6 * float(np.abs(there).max()))
     apart = np.abs(found.of_points(centers(of.found)) - there).max() / spread
-    return max(relative(found.scale, of.way.scale), relative(found.rotation, of.way.rotation), float(apart))
+    return max(
+        relative(found.scale, of.way.scale), relative(found.rotation, of.way.rotation), float(apart)
+    )
 
 
 @case("aligned, {name}", name=WORLDS)
@@ -109,7 +113,13 @@ def lost(share: float, by: float) -> Outcome:
     found = frame(of.found, of.given, np.ones(VIEWS, bool))
     if not np.array_equal(found.led, np.arange(VIEWS) >= round(share * VIEWS)):
         raise ValueError(f"{found.led.sum()} views are believed")
-    return beside(Similarity(*found[:3]), lambda: Similarity(*alignment(of.found, of.given)), true, EXACT, differ)
+    return beside(
+        Similarity(*found[:3]),
+        lambda: Similarity(*alignment(of.found, of.given)),
+        true,
+        EXACT,
+        differ,
+    )
 
 
 def photographed(database: Path) -> pycolmap.Reconstruction:
@@ -117,7 +127,10 @@ def photographed(database: Path) -> pycolmap.Reconstruction:
     pycolmap.set_random_seed(0)
     options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
     options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 16, 300
-    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.PINHOLE, [900, 900, 512, 384]
+    options.camera_model_id, options.camera_params = (
+        pycolmap.CameraModelId.PINHOLE,
+        [900, 900, 512, 384],
+    )
     noise.point2D_stddev = 0.5
     with pycolmap.Database.open(database) as opened:
         model = pycolmap.synthesize_dataset(options, opened)
@@ -131,7 +144,9 @@ def images_of(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
 
 def posed(model: pycolmap.Reconstruction) -> np.ndarray:
     """Poses [V, 4, 4] of its images."""
-    return np.stack([np.vstack([image.cam_from_world().matrix(), np.eye(4)[3]]) for image in images_of(model)])
+    return np.stack(
+        [np.vstack([image.cam_from_world().matrix(), np.eye(4)[3]]) for image in images_of(model)]
+    )
 
 
 ADJUSTED: dict[str, tuple[Similarity, float, float]] = {
@@ -192,7 +207,9 @@ def fits(name: str) -> Outcome:
 
     def plainly() -> np.ndarray:
         design = np.column_stack([points, np.ones(len(points))]).astype(np.float32)
-        return np.asarray(design @ np.linalg.solve(design.T @ design, design.T @ exact.astype(np.float32)))
+        return np.asarray(
+            design @ np.linalg.solve(design.T @ design, design.T @ exact.astype(np.float32))
+        )
 
     spread = np.abs(exact - exact.mean(0)).max()
     found = fitted(points, exact).of_points(points)

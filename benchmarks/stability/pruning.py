@@ -1,4 +1,6 @@
-"""Colours and logits that break printed soft histograms (Eq 13) and masks (Eqs 11-12; docs/method.md, section 5)."""
+"""Colours and logits that break printed soft histograms (Eq 13) and masks (Eqs 11-12;
+docs/method.md, section 5).
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ def exact_histogram(values: Tensor, low: Tensor, high: Tensor) -> np.ndarray:
         inside = (v - mpmath.mpf(low.item())) / width
         below = [[1 / (1 + mpmath.exp(min(20 * (x - edge), mpmath.mpf(10) ** 6))) for edge in range(1, N_BINS)]
                  for x in inside]  # fmt: skip
-        mass = np.diff(np.array([[0, *row, 1] for row in below], object).reshape(-1, N_BINS + 1), axis=1)
+        mass = np.diff(
+            np.array([[0, *row, 1] for row in below], object).reshape(-1, N_BINS + 1), axis=1
+        )
         return (mass.sum(0) / max(len(values), 1)).astype(np.float64)
 
 
@@ -53,11 +57,15 @@ def histogram(name: str) -> Outcome:
     values = VALUES[name]()
     low, high = values.aminmax() if "beyond" not in name else (torch.tensor(0.0), torch.tensor(1.0))
     inputs = [v.clone().requires_grad_(True) for v in (values, low, high)]
-    found = soft_histogram(inputs[0], torch.ones(len(values), dtype=torch.bool), N_BINS, *inputs[1:])
+    found = soft_histogram(
+        inputs[0], torch.ones(len(values), dtype=torch.bool), N_BINS, *inputs[1:]
+    )
     slopes = torch.autograd.grad(found.square().sum(), inputs)
     if not all(torch.isfinite(s).all() for s in slopes):
         raise ValueError("a gradient is not finite")
-    error = max(relative(found.detach(), exact_histogram(values, low, high)), abs(found.sum().item() - 1))
+    error = max(
+        relative(found.detach(), exact_histogram(values, low, high)), abs(found.sum().item() - 1)
+    )
     return Outcome(error, HISTOGRAM)
 
 
@@ -85,16 +93,25 @@ def masks(size: float) -> Outcome:
     if not torch.isfinite(slope).all() or not ((hard == 0) | (hard == 1)).all():
         raise ValueError("a mask is neither 0 nor 1, or a gradient is not finite")
     limit = min(size, MAX_LOGIT)
-    exact = [float(np.prod([1 / (1 + mpmath.exp(-limit * s)) for s in row])) for row in signs.tolist()]
+    exact = [
+        float(np.prod([1 / (1 + mpmath.exp(-limit * s)) for s in row])) for row in signs.tolist()
+    ]
     return Outcome(relative(soft.detach(), exact), 1e-6)
 
 
 @case("a mask of 0 renders as if removed")
 def masked_render() -> Outcome:
-    """Image of masked Gaussians against that of the rest; stored log-scales get a finite gradient."""
+    """Image of masked Gaussians against that of the rest; stored log-scales get a finite
+    gradient.
+    """
     g = torch.Generator().manual_seed(0)
-    means = torch.rand(40, 3, generator=g) * torch.tensor([2.4, 1.6, 3.0]) - torch.tensor([1.2, 0.8, -1.0])
-    quats, log_scales = torch.randn(40, 4, generator=g), (torch.rand(40, 3, generator=g) * 0.15 + 0.02).log()
+    means = torch.rand(40, 3, generator=g) * torch.tensor([2.4, 1.6, 3.0]) - torch.tensor(
+        [1.2, 0.8, -1.0]
+    )
+    quats, log_scales = (
+        torch.randn(40, 4, generator=g),
+        (torch.rand(40, 3, generator=g) * 0.15 + 0.02).log(),
+    )
     opacities, colors = torch.rand(40, generator=g) * 0.8 + 0.1, torch.rand(40, 3, generator=g)
     K = torch.tensor([[[35.0, 0, 20], [0, 33, 14], [0, 0, 1]]])
     camera, mask = (torch.eye(4)[None], K, 40, 28), (torch.arange(40) % 2).float()

@@ -1,7 +1,7 @@
 """Point sets that break naive farthest-point sampling (docs/method.md, section 2).
 
-Errors are the covering radius of our centres over that of exact sampling, minus 1 (from another first point, which
-alone moves it by a tenth).
+Errors are the covering radius of our centres over that of exact sampling, minus 1 (from another
+first point, which alone moves it by a tenth).
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ POINTS: dict[str, Callable[[], np.ndarray]] = {
     "all coincident": lambda: np.full((600, 3), 0.3),
     "collinear": lambda: box() * [1, 0, 0],
     "coplanar": lambda: box() * [1, 1, 0],
-    "cubic lattice": lambda: np.stack(np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), -1).reshape(-1, 3),
+    "cubic lattice": lambda: np.stack(
+        np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), -1
+    ).reshape(-1, 3),
     "half of them in a speck": lambda: np.concatenate([box(300) * 1e-6, box(600)[300:]]),
 }
 
@@ -65,12 +67,17 @@ def reach(means: np.ndarray, centers: Any) -> float:
 
 @case("{name}", name=POINTS)
 def points(name: str) -> Outcome:
-    """Raises ValueError if members are not unique, not within the radius, or not led by their centre."""
+    """Raises ValueError if members are not unique, not within the radius, or not led by their
+    centre.
+    """
     means = POINTS[name]()
     found = regions_of(means, DescribeSection(n_regions=N_REGIONS, region_size=SIZE))
     present = found.members >= 0
     distance = np.linalg.norm(means[found.members] - means[found.centers][:, None], axis=-1)
-    unique = all(len(np.unique(row[here])) == here.sum() for row, here in zip(found.members, present, strict=True))
+    unique = all(
+        len(np.unique(row[here])) == here.sum()
+        for row, here in zip(found.members, present, strict=True)
+    )
     covered = reach(means, found.centers)
     if not unique or (found.members[:, 0] != found.centers).any():
         raise ValueError("members are not unique, or not led by their centre")

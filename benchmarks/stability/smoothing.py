@@ -11,7 +11,16 @@ import numpy as np
 
 from benchmarks.stability.case import Outcome, beside, case
 from chebsplat.lifting import smoothing
-from chebsplat.lifting.smoothing import ANGLE, COLOR, DISTANCE, PLANE, REACH, affinities, room_unit, smooth
+from chebsplat.lifting.smoothing import (
+    ANGLE,
+    COLOR,
+    DISTANCE,
+    PLANE,
+    REACH,
+    affinities,
+    room_unit,
+    smooth,
+)
 
 N = 20  # no more than have all others for neighbours
 TOLERANCE = 1e-5  # float32 sums of features, normals of float64
@@ -55,14 +64,20 @@ CLOUDS: dict[str, Callable[[], Cloud]] = {
     "units of 1e+06": lambda: changed(means=lambda v: 1e6 * v, unit=lambda u: 1e6),
     "1e+04 from the origin": lambda: changed(means=lambda v: v + 1e4),
     "1e+07 from the origin": lambda: changed(means=lambda v: v + 1e7),
-    "an outlier at 1e+08": lambda: changed(means=lambda v: np.where(np.arange(N)[:, None] == 4, 1e8, v)),
-    "normals of any sign": lambda: changed(normals=lambda v: v * np.where(np.arange(N) % 2, 1, -1)[:, None]),
+    "an outlier at 1e+08": lambda: changed(
+        means=lambda v: np.where(np.arange(N)[:, None] == 4, 1e8, v)
+    ),
+    "normals of any sign": lambda: changed(
+        normals=lambda v: v * np.where(np.arange(N) % 2, 1, -1)[:, None]
+    ),
     "one normal for all": lambda: changed(normals=lambda v: v * 0 + (0, 0, 1)),
     "no evidence": lambda: changed(evidence=lambda e: 0 * e),
     "evidence of 1e-30": lambda: changed(evidence=lambda e: 1e-30 * e),
     "evidence of 1e+30": lambda: changed(evidence=lambda e: 1e30 * e),
     "one Gaussian with evidence": lambda: changed(evidence=lambda e: e * (np.arange(N) == 7)),
-    "evidence of 1e-15 to 1e+15": lambda: changed(evidence=lambda e: e * np.geomspace(1e-15, 1e15, N)),
+    "evidence of 1e-15 to 1e+15": lambda: changed(
+        evidence=lambda e: e * np.geomspace(1e-15, 1e15, N)
+    ),
     "features of 1e-30": lambda: changed(features=lambda f: 1e-30 * f),
     "features of 1e+30": lambda: changed(features=lambda f: 1e30 * f),
 }
@@ -75,7 +90,9 @@ def smoothed(of: Cloud, dtype: type) -> np.ndarray:
     square, across = (x * x).sum(-1), np.einsum("ijd,id->ij", x, normals)
     angles = np.arccos(np.abs(normals @ normals.T).clip(0, 1))
     differ = ((colors[None] - colors[:, None]) ** 2).sum(-1)
-    exponent = square / DISTANCE**2 + (across / PLANE) ** 2 + differ / COLOR**2 + (angles / ANGLE) ** 2
+    exponent = (
+        square / DISTANCE**2 + (across / PLANE) ** 2 + differ / COLOR**2 + (angles / ANGLE) ** 2
+    )
     weights = np.where(square <= REACH**2, np.exp(-exponent / 2), 0)
     weights[np.arange(len(x)), np.arange(len(x))] = 1
     total = weights @ evidence

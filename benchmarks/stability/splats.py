@@ -1,7 +1,10 @@
-"""Gaussians that break rasterizers, in the modules of a default run: images, gradients, colours, planes, features.
+"""Gaussians that break rasterizers, in the modules of a default run: images, gradients, colours,
+planes, features.
 
-Errors are those of float32 on the CPU against float64 in plain torch or numpy. Of images and features it is the mean
-difference over the mean, of gradients that of norms: where float32 rounds an alpha across 1/255, one pixel differs.
+Errors are those of float32 on the CPU against float64 in plain torch or numpy. Of images and
+features it is the mean
+difference over the mean, of gradients that of norms: where float32 rounds an alpha across 1/255,
+  one pixel differs.
 """
 
 from __future__ import annotations
@@ -33,7 +36,8 @@ def gaussians() -> dict[str, Tensor]:
     """Means before a camera at the origin, wxyz quaternions, deviations, opacities and colours."""
     g = torch.Generator().manual_seed(0)
     return {
-        "means": torch.rand(N, 3, generator=g) * torch.tensor([2.4, 1.6, 3.0]) - torch.tensor([1.2, 0.8, -1.0]),
+        "means": torch.rand(N, 3, generator=g) * torch.tensor([2.4, 1.6, 3.0])
+        - torch.tensor([1.2, 0.8, -1.0]),
         "quats": torch.randn(N, 4, generator=g),
         "scales": torch.rand(N, 3, generator=g) * 0.15 + 0.02,
         "opacities": torch.rand(N, generator=g) * 0.8 + 0.1,
@@ -70,12 +74,15 @@ SPOILED: dict[str, Callable[[dict[str, Tensor]], object]] = {
 
 
 def rendered(name: str, dtype: torch.dtype, mode: str) -> tuple[Tensor, list[Tensor]]:
-    """Image and coverage [1, H, W, 4], and the gradients of a loss to everything that the Gaussians are."""
+    """Image and coverage [1, H, W, 4], and the gradients of a loss to everything that the Gaussians
+    are.
+    """
     spoiled = gaussians()
     SPOILED[name](spoiled)
     leaves = [value.to(dtype, copy=True).requires_grad_(True) for value in spoiled.values()]
     camera = torch.eye(4, dtype=dtype)[None], K.to(dtype)[None], WIDTH, HEIGHT
-    image, alpha, _ = rasterize(*leaves, *camera, rasterize_mode=mode)  # float64 takes the reference
+    # float64 takes the reference
+    image, alpha, _ = rasterize(*leaves, *camera, rasterize_mode=mode)
     weights = torch.randn(HEIGHT, WIDTH, 4, generator=torch.Generator().manual_seed(1)).to(dtype)
     both = torch.cat([image, alpha], -1)
     return both.detach(), list(torch.autograd.grad((both[0] * weights).mean(), leaves))
@@ -90,13 +97,17 @@ def apart(found: Tensor, exact: Tensor) -> float:
 
 @case("image, {mode}, {name}", mode=["classic", "antialiased"], name=SPOILED)
 def image(mode: str, name: str) -> Outcome:
-    return Outcome(apart(rendered(name, torch.float32, mode)[0], rendered(name, torch.float64, mode)[0]), IMAGE)
+    return Outcome(
+        apart(rendered(name, torch.float32, mode)[0], rendered(name, torch.float64, mode)[0]), IMAGE
+    )
 
 
 @case("gradient, {mode}, {name}", mode=["classic", "antialiased"], name=SPOILED)
 def gradient(mode: str, name: str) -> Outcome:
     """Raises ValueError where one is not finite."""
-    pairs = zip(rendered(name, torch.float32, mode)[1], rendered(name, torch.float64, mode)[1], strict=True)
+    pairs = zip(
+        rendered(name, torch.float32, mode)[1], rendered(name, torch.float64, mode)[1], strict=True
+    )
     errors = []
     for found, exact in pairs:
         if not found.isfinite().all():
@@ -111,8 +122,12 @@ def planes(name: str) -> Outcome:
     spoiled, both = gaussians(), []
     SPOILED[name](spoiled)
     for dtype in (torch.float32, torch.float64):
-        leaves = [spoiled[key].to(dtype, copy=True).requires_grad_(True) for key in ("means", "quats")]
-        found = planes_in_view(*leaves, spoiled["scales"].to(dtype), torch.eye(4, dtype=dtype), K.to(dtype), 0.01)
+        leaves = [
+            spoiled[key].to(dtype, copy=True).requires_grad_(True) for key in ("means", "quats")
+        ]
+        found = planes_in_view(
+            *leaves, spoiled["scales"].to(dtype), torch.eye(4, dtype=dtype), K.to(dtype), 0.01
+        )
         slopes = torch.autograd.grad(found.sum(), leaves)
         lengths = spoiled["quats"].to(dtype).abs().amax(1, keepdim=True)
         both.append([found.detach(), slopes[0], slopes[1] * lengths])
@@ -126,7 +141,13 @@ def features(name: str) -> Outcome:
     SPOILED[name](spoiled)
     parts = tuple(spoiled[key].numpy() for key in ("means", "quats", "scales", "opacities"))
     values = np.random.default_rng(0).normal(size=(HEIGHT // 4, WIDTH // 4, 5)).astype(np.float32)
-    rest = np.eye(4), K.double().numpy(), (WIDTH, HEIGHT), values, np.ones(values.shape[:2], np.float32)
+    rest = (
+        np.eye(4),
+        K.double().numpy(),
+        (WIDTH, HEIGHT),
+        values,
+        np.ones(values.shape[:2], np.float32),
+    )
     found, (weights, sums) = lift.lift(parts, *rest), reference.lift(parts, *rest)
     dense = np.zeros((N, 6))
     dense[found.ids] = np.column_stack([found.weights, found.sums])
@@ -139,8 +160,15 @@ def finished(name: str) -> Outcome:
     """Share of values of its frame, depth, coverage, normals and frustum that cannot be."""
     spoiled = gaussians()
     SPOILED[name](spoiled)
-    raw = {"means": spoiled["means"], "quats": spoiled["quats"], "log_scales": spoiled["scales"].log().clamp_min(-60)}
-    raw |= {"logit_opacities": spoiled["opacities"].logit(), "sh0": (spoiled["colors"][:, None] - 0.5) / 0.282}
+    raw = {
+        "means": spoiled["means"],
+        "quats": spoiled["quats"],
+        "log_scales": spoiled["scales"].log().clamp_min(-60),
+    }
+    raw |= {
+        "logit_opacities": spoiled["opacities"].logit(),
+        "sh0": (spoiled["colors"][:, None] - 0.5) / 0.282,
+    }
     raw |= {"shN": torch.zeros(N, 15, 3), "degrees": torch.zeros(N, dtype=torch.uint8)}
     parameters = {key: value.numpy() for key, value in raw.items()}
     view, renderer = View(K, torch.eye(4), WIDTH, HEIGHT), SceneRenderer(parameters)
@@ -148,7 +176,11 @@ def finished(name: str) -> Outcome:
     depth, covered = renderer.render_depth(view)
     normals = surface_of(parameters)[0]
     index = in_frustum(renderer.means, view, renderer.reach)
-    wrong = [~np.isnan(depth) & ~(depth > 0), ~((covered >= 0) & (covered <= 1.0001)), ~np.isfinite(normals)]
+    wrong = [
+        ~np.isnan(depth) & ~(depth > 0),
+        ~((covered >= 0) & (covered <= 1.0001)),
+        ~np.isfinite(normals),
+    ]
     if frame.shape != (HEIGHT, WIDTH, 3) or not 0 < len(index) <= N:
         raise ValueError("there is no frame")
     return Outcome(float(np.mean([part.mean() for part in wrong])), 0.0)
@@ -156,9 +188,16 @@ def finished(name: str) -> Outcome:
 
 @case("1e6 on a pixel, opacity {opacity}", opacity=[0.002, 0.0041, 0.05, 0.5, 0.7])
 def on_a_pixel(opacity: float) -> Outcome:
-    """Equal Gaussians, one behind another, against the sum of the series that ends at a transmittance of 1e-4."""
+    """Equal Gaussians, one behind another, against the sum of the series that ends at a
+    transmittance of 1e-4.
+    """
     n, size = 1_000_000, 8
-    camera = torch.eye(4)[None], torch.tensor([[[40.0, 0, size / 2], [0, 40.0, size / 2], [0, 0, 1]]]), size, size
+    camera = (
+        torch.eye(4)[None],
+        torch.tensor([[[40.0, 0, size / 2], [0, 40.0, size / 2], [0, 0, 1]]]),
+        size,
+        size,
+    )
     means = torch.tensor([[0.5 / 40, 0.5 / 40, 1.0]]).repeat(n, 1)  # the middle of pixel (4, 4)
     shape = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.full((n, 3), 1e-4)
     opacities = torch.full((n,), opacity).requires_grad_(True)
@@ -167,7 +206,9 @@ def on_a_pixel(opacity: float) -> Outcome:
     left, shown = 1.0, 0
     while opacity >= 1 / 255 and left * (1 - opacity) > 1e-4:
         left, shown = left * (1 - opacity), shown + 1
-    to_opacities, to_colors = torch.autograd.grad(found[0, 4, 4].sum() + alpha[0, 4, 4].sum(), [opacities, colors])
+    to_opacities, to_colors = torch.autograd.grad(
+        found[0, 4, 4].sum() + alpha[0, 4, 4].sum(), [opacities, colors]
+    )
     if not (to_opacities.isfinite().all() and int((to_colors[:, 0] != 0).sum()) == shown):
         raise ValueError("a gradient is not finite, or reaches Gaussians that nobody sees")
     values = [*found[0, 4, 4].tolist(), alpha[0, 4, 4, 0].item(), to_colors[:, 0].sum().item()]
@@ -182,20 +223,29 @@ def sh(size: float, degree: int) -> Outcome:
     means, both = torch.randn(N, 3, generator=g), []
     for dtype in (torch.float32, torch.float64):
         leaves = [band.to(dtype, copy=True).requires_grad_(True) for band in bands[: degree + 1]]
-        found = colors_in_view(leaves, None, index, means.to(dtype), torch.zeros(3, dtype=dtype), degree)
+        found = colors_in_view(
+            leaves, None, index, means.to(dtype), torch.zeros(3, dtype=dtype), degree
+        )
         slopes = torch.autograd.grad(found.sum(), leaves)
         both.append([found.detach(), *slopes])
     values = basis(torch.nn.functional.normalize(means[index].double(), dim=-1), degree)
     coefficients = torch.cat([band[index].double() for band in bands[: degree + 1]], 1)
     exact = (torch.einsum("nk,nkc->nc", values, coefficients) + 0.5).clamp_min(0)
-    return Outcome(max(relative(both[0][0], exact), *(relative(*pair) for pair in zip(*both, strict=True))), 1e-5)
+    return Outcome(
+        max(relative(both[0][0], exact), *(relative(*pair) for pair in zip(*both, strict=True))),
+        1e-5,
+    )
 
 
 @case("colour loss of renders of {size:.0e}", size=[0.0, 1.0, 1e2, 1e4, 1e8])
 def loss(size: float) -> Outcome:
     """The fused loss and its gradient against float64 in plain torch."""
     g = torch.Generator().manual_seed(0)
-    target, drawn, both = torch.rand(HEIGHT, WIDTH, 3, generator=g), torch.rand(HEIGHT, WIDTH, 3, generator=g), []
+    target, drawn, both = (
+        torch.rand(HEIGHT, WIDTH, 3, generator=g),
+        torch.rand(HEIGHT, WIDTH, 3, generator=g),
+        [],
+    )
     for dtype, function in ((torch.float32, photometric), (torch.float64, photometric_reference)):
         render = (size * drawn).to(dtype).requires_grad_(True)
         value = function(render, target.to(dtype), None, 0.2)
@@ -217,8 +267,14 @@ POINTS: dict[str, Callable[[Tensor], Tensor]] = {
 
 @case("Gaussians at points of {name}", name=POINTS)
 def points(name: str) -> Outcome:
-    """Share of initial values that are not finite; raises ValueError where a covariance is not positive."""
-    means = POINTS[name](torch.randn(200, 3, generator=torch.Generator().manual_seed(0))).double().numpy()
+    """Share of initial values that are not finite; raises ValueError where a covariance is not
+    positive.
+    """
+    means = (
+        POINTS[name](torch.randn(200, 3, generator=torch.Generator().manual_seed(0)))
+        .double()
+        .numpy()
+    )
     shapes, normals = local_shape(means, 16)
     if np.linalg.eigvalsh(shapes.astype(np.float64)).min() <= 0:
         raise ValueError("a covariance is not positive")
@@ -229,12 +285,19 @@ def points(name: str) -> Outcome:
 
 @case("halves, {name}", name=SPOILED)
 def halves(name: str) -> Outcome:
-    """Share of opacities and scales of split Gaussians that are not finite, or larger than before."""
+    """Share of opacities and scales of split Gaussians that are not finite, or larger than
+    before.
+    """
     spoiled = gaussians()
     SPOILED[name](spoiled)
     logits, log_scales = spoiled["opacities"].logit(), spoiled["scales"].log().clamp_min(-60)
     offsets = spoiled["scales"] * torch.randn(N, 3, generator=torch.Generator().manual_seed(2))
     opacity = shared_opacity(logits, log_scales, spoiled["quats"], offsets)
     smaller = shared_scales(log_scales, spoiled["quats"], offsets)
-    wrong = [~(opacity <= logits + 1e-4), ~opacity.isfinite(), ~(smaller <= log_scales), ~smaller.isfinite()]
+    wrong = [
+        ~(opacity <= logits + 1e-4),
+        ~opacity.isfinite(),
+        ~(smaller <= log_scales),
+        ~smaller.isfinite(),
+    ]
     return Outcome(float(torch.cat([part.float().flatten() for part in wrong]).mean()), 0.0)

@@ -35,7 +35,11 @@ class Photos(NamedTuple):
 def photos(unit: float = 1.0, shift: float = 0.0, baseline: float = 0.15) -> Photos:
     """A wall of smooth noise from places side by side."""
     coarse = torch.from_numpy(np.random.default_rng(0).random((1, 1, 40, 60))).float()
-    texture = torch.nn.functional.interpolate(coarse, scale_factor=6, mode="bicubic").numpy()[0, 0].clip(0.02, 1)
+    texture = (
+        torch.nn.functional.interpolate(coarse, scale_factor=6, mode="bicubic")
+        .numpy()[0, 0]
+        .clip(0.02, 1)
+    )
     row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     grey, poses = [], np.tile(np.eye(4), (VIEWS, 1, 1))
     for view in range(VIEWS):
@@ -44,7 +48,12 @@ def photos(unit: float = 1.0, shift: float = 0.0, baseline: float = 0.15) -> Pho
         grey.append(_bilinear(texture, (y + 2) * 55, (x + 2.5) * 55))
         poses[view, 0, 3] = -unit * place
     poses[:, :3, 3] -= shift
-    return Photos(np.stack(grey).astype(np.float32), np.ones((VIEWS, HEIGHT, WIDTH), np.float32), poses, unit * WALL)
+    return Photos(
+        np.stack(grey).astype(np.float32),
+        np.ones((VIEWS, HEIGHT, WIDTH), np.float32),
+        poses,
+        unit * WALL,
+    )
 
 
 def _bilinear(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -62,7 +71,10 @@ def lit(*stops: float) -> Photos:
 
 def sweep(of: Photos) -> tuple[np.ndarray, np.ndarray]:
     tried = 1 / torch.linspace(1 / (0.5 * of.depth), 1 / (2 * of.depth), DEPTHS)
-    given = (torch.from_numpy(part).float() for part in (of.grey, of.valid, np.tile(K, (VIEWS, 1, 1)), of.poses))
+    given = (
+        torch.from_numpy(part).float()
+        for part in (of.grey, of.valid, np.tile(K, (VIEWS, 1, 1)), of.poses)
+    )
     depth, cost = swept_depth(*given, 0, [1, 2, 3], tried)
     return depth.numpy(), cost.numpy()
 
@@ -70,16 +82,24 @@ def sweep(of: Photos) -> tuple[np.ndarray, np.ndarray]:
 def plainly(of: Photos) -> np.ndarray:
     """The tried depth of the least squared difference of single pixels."""
     tried = 1 / torch.linspace(1 / (0.5 * of.depth), 1 / (2 * of.depth), DEPTHS)
-    grey, directions, costs = torch.from_numpy(of.grey), rays(torch.from_numpy(K).float(), HEIGHT, WIDTH), []
+    grey, directions, costs = (
+        torch.from_numpy(of.grey),
+        rays(torch.from_numpy(K).float(), HEIGHT, WIDTH),
+        [],
+    )
     for z in tried:
         cost = torch.zeros(HEIGHT, WIDTH)
         for other in (1, 2, 3):
             between = torch.from_numpy(of.poses[other] @ np.linalg.inv(of.poses[0])).float()
-            x, y, depth = torch.from_numpy(K).float() @ (between[:3, :3] @ directions * z + between[:3, 3:])
-            place = torch.stack([x / depth / WIDTH * 2 - 1, y / depth / HEIGHT * 2 - 1], -1).reshape(
-                1, HEIGHT, WIDTH, 2
+            x, y, depth = torch.from_numpy(K).float() @ (
+                between[:3, :3] @ directions * z + between[:3, 3:]
             )
-            warped = torch.nn.functional.grid_sample(grey[None, None, other], place, align_corners=False)[0, 0]
+            place = torch.stack(
+                [x / depth / WIDTH * 2 - 1, y / depth / HEIGHT * 2 - 1], -1
+            ).reshape(1, HEIGHT, WIDTH, 2)
+            warped = torch.nn.functional.grid_sample(
+                grey[None, None, other], place, align_corners=False
+            )[0, 0]
             cost += (warped - grey[0]).square()
         costs.append(cost)
     return tried[torch.stack(costs).argmin(0)].numpy()
@@ -96,7 +116,9 @@ WALLS: dict[str, Callable[[], Photos]] = {
     "in units of 1e+04": lambda: photos(1e4),
     "1e+02 from the origin": lambda: photos(shift=1e2),
     "two stops apart": lambda: lit(0, -2, -4, -6),
-    "of a contrast of 1e-2": lambda: photos()._replace(grey=(0.5 + 1e-2 * (photos().grey - 0.5)).astype(np.float32)),
+    "of a contrast of 1e-2": lambda: photos()._replace(
+        grey=(0.5 + 1e-2 * (photos().grey - 0.5)).astype(np.float32)
+    ),
     "one view of noise": lambda: photos()._replace(grey=_spoiled(photos().grey, 2)),
     "one view masked": lambda: photos()._replace(
         valid=np.where(np.arange(VIEWS)[:, None, None] == 2, 0, photos().valid)

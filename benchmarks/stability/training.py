@@ -1,7 +1,8 @@
-"""Trainings that ought to break: each ends with finite Gaussians, or stops and names its step and cause.
+"""Trainings that ought to break: each ends with finite Gaussians, or stops and names its step and
+cause.
 
-The error is the share of values that are not finite in what would be published, 1 where the training stopped without
-naming its step.
+The error is the share of values that are not finite in what would be published, 1 where the
+training stopped without naming its step.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ HEIGHT, WIDTH, CHANNELS = 40, 48, 8
 
 
 def four_views() -> Views:
-    """Photos of noise, 48 x 40, in an arc about the origin, with unit features of noise at a quarter of the size."""
+    """Photos of noise, 48 x 40, in an arc about the origin, with unit features of noise at a
+    quarter of the size.
+    """
     g = torch.Generator().manual_seed(1)
     K = torch.tensor([[40.0, 0, WIDTH / 2], [0, 40.0, HEIGHT / 2], [0, 0, 1]])
     angles, poses = torch.linspace(0, 1.2, 4), torch.eye(4).repeat(4, 1, 1)
@@ -36,7 +39,14 @@ def four_views() -> Views:
     poses[:, 2, 3] = 4
     images = (torch.rand(4, HEIGHT, WIDTH, 3, generator=g) * 255).byte()
     features = torch.nn.functional.normalize(torch.randn(4, 10, 12, CHANNELS, generator=g), dim=-1)
-    return Views([f"view{k}" for k in range(4)], images, K.repeat(4, 1, 1), poses, None, lambda k: features[k])
+    return Views(
+        [f"view{k}" for k in range(4)],
+        images,
+        K.repeat(4, 1, 1),
+        poses,
+        None,
+        lambda k: features[k],
+    )
 
 
 def sphere(n: int) -> np.ndarray:
@@ -44,21 +54,36 @@ def sphere(n: int) -> np.ndarray:
     return torch.nn.functional.normalize(points, dim=-1).numpy()
 
 
-def tiny_trainer(means: np.ndarray | None = None, views: Views | None = None, **settings: Any) -> Trainer:
-    """A trainer of few Gaussians, by default 300 on a unit sphere; settings: what differs in the train section."""
+def tiny_trainer(
+    means: np.ndarray | None = None, views: Views | None = None, **settings: Any
+) -> Trainer:
+    """A trainer of few Gaussians, by default 300 on a unit sphere; settings: what differs in the
+    train section.
+    """
     means = sphere(300) if means is None else means
-    colors = (torch.rand(len(means), 3, generator=torch.Generator().manual_seed(2)) * 255).byte().numpy()
-    shapes = local_shape(means, 8)[0] if len(means) > 1 else np.eye(3, dtype=np.float32)[None] * 0.01
+    colors = (
+        (torch.rand(len(means), 3, generator=torch.Generator().manual_seed(2)) * 255).byte().numpy()
+    )
+    shapes = (
+        local_shape(means, 8)[0] if len(means) > 1 else np.eye(3, dtype=np.float32)[None] * 0.01
+    )
     small = {
         "steps": 20,
         "min_gaussians": 8,
         "max_gaussians": len(means) + 100,
         "n_densify": 2,
     }
-    config = Config.model_validate({"train": small | settings, "describe": {"n_regions": 24, "region_size": 16}})
+    config = Config.model_validate(
+        {"train": small | settings, "describe": {"n_regions": 24, "region_size": 16}}
+    )
     torch.manual_seed(config.train.seed)
     kind = PrintedScene if config.train.method == "printed" else SceneModel
-    model = kind(initial_gaussians(means, colors, shapes, opacity=0.5), config.describe, config.train, CHANNELS)
+    model = kind(
+        initial_gaussians(means, colors, shapes, opacity=0.5),
+        config.describe,
+        config.train,
+        CHANNELS,
+    )
     views = four_views() if views is None else views
     n_views, height, width = views.images.shape[:3]
     train = resolved(config.train, Evidence(n_views, n_views * height * width))
@@ -136,19 +161,29 @@ SCENES: dict[str, Callable[[], Trainer]] = {
     "two coincident Gaussians": lambda: tiny_trainer(np.zeros((2, 3), np.float32), min_gaussians=1),
     "one plane": lambda: tiny_trainer(_flat()),
     "a line": lambda: tiny_trainer(_flat() * np.array([1, 0, 0], np.float32)),
-    "a camera inside a Gaussian": lambda: _raw(means=_at_the_camera, log_scales=lambda v: v[0].fill_(1.0)),
+    "a camera inside a Gaussian": lambda: _raw(
+        means=_at_the_camera, log_scales=lambda v: v[0].fill_(1.0)
+    ),
     "a Gaussian of scale 1e30": lambda: _raw(log_scales=lambda v: v[0].fill_(69.0)),
     "needles of 1e-20": lambda: _raw(log_scales=lambda v: v[:, 0].fill_(-46.0)),
     "needles of 1e+03": lambda: _raw(log_scales=lambda v: v[:, 0].fill_(7.0)),
     "near-flat Gaussians": lambda: _raw(log_scales=lambda v: v[:, 2].fill_(-30.0)),
     "quaternions of 1e-30": lambda: _raw(quats=lambda v: v.mul_(1e-30)),
-    "SH of 1e+04": lambda: _raw(sh0=lambda v: v.mul_(1e4), sh1=lambda v: v.fill_(1e4), sh3=lambda v: v.fill_(-1e4)),
-    "all on one pixel": lambda: _raw(means=lambda v: v.copy_(v[:1].expand_as(v)), log_scales=lambda v: v.fill_(-7.0)),
+    "SH of 1e+04": lambda: _raw(
+        sh0=lambda v: v.mul_(1e4), sh1=lambda v: v.fill_(1e4), sh3=lambda v: v.fill_(-1e4)
+    ),
+    "all on one pixel": lambda: _raw(
+        means=lambda v: v.copy_(v[:1].expand_as(v)), log_scales=lambda v: v.fill_(-7.0)
+    ),
     "quaternions of 0": lambda: _raw(quats=lambda v: v[::5].zero_()),
-    "opacity logits of ±1e4": lambda: _raw(logit_opacities=lambda v: (v[::2].fill_(1e4), v[1::2].fill_(-1e4))),
+    "opacity logits of ±1e4": lambda: _raw(
+        logit_opacities=lambda v: (v[::2].fill_(1e4), v[1::2].fill_(-1e4))
+    ),
     "a NaN colour": lambda: _raw(sh0=lambda v: v[3].fill_(torch.nan)),
     "NaN features of one Gaussian": lambda: _raw(features=lambda v: v[3].fill_(torch.nan)),
-    "teacher features of norm 1e6": lambda: _with_views(features=lambda v: lambda k: 1e6 * v.features(k)),  # type: ignore[misc]
+    "teacher features of norm 1e6": lambda: _with_views(
+        features=lambda v: lambda k: 1e6 * v.features(k)
+    ),  # type: ignore[misc]
     "teacher features of 0": lambda: _with_views(features=lambda v: lambda k: 0 * v.features(k)),  # type: ignore[misc]
     "one view's features NaN": lambda: _with_views(features=_corrupt(float("nan"))),
     "one view's features 1e30": lambda: _with_views(features=_corrupt(1e30)),
@@ -172,4 +207,6 @@ def training(name: str) -> Outcome:
     except DataFailure as failure:
         return Outcome(float(not str(failure).startswith("step ")), 0.0)
     values = [*np.concatenate([value.ravel().astype(np.float64) for value in parameters.values()])]
-    return Outcome(float(1 - np.isfinite([*values, trainer.held_in_psnr(list(range(4)))]).mean()), 0.0)
+    return Outcome(
+        float(1 - np.isfinite([*values, trainer.held_in_psnr(list(range(4)))]).mean()), 0.0
+    )

@@ -1,8 +1,9 @@
-"""What lessons of scenes are worth in other scenes: mIoU of shape alone, and blended with the teacher's averages.
+"""What lessons of scenes are worth in other scenes: mIoU of shape alone, and blended with the
+teacher's averages.
 
-Of finished scenes (--scenes), each is asked in turn with lessons of the others: of 1, 2, 4, ... of them, alone and
-beside what ships; of few of their points; of points that a user labelled in one of them. A figure is the mean over the
-scenes of a scene's mIoU over its described points, in per cent.
+Of finished scenes (--scenes), each is asked in turn with lessons of the others: of 1, 2, 4, ... of
+them, alone and beside what ships; of few of their points; of points that a user labelled in one of
+them. A figure is the mean over the scenes of a scene's mIoU over its described points, in per cent.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ from chebsplat.synthetic import CLASS_NAMES
 
 def main(arguments: Sequence[str]) -> None:
     parser = shared.parser("lessons", __doc__)
-    parser.add_argument("--scenes", nargs="+", required=True, help="finished scenes of the embedded teacher")
+    parser.add_argument(
+        "--scenes", nargs="+", required=True, help="finished scenes of the embedded teacher"
+    )
     options = parser.parse_args(arguments)
     knowledge = read_knowledge(SHIPPED)
     encoder = PointEncoder.restored(knowledge.encoder, knowledge.weights)
@@ -49,7 +52,10 @@ def main(arguments: Sequence[str]) -> None:
     everyone = [asked.taught(k) for k in range(len(rooms))]
     for count in (1, 2, 4, 8, 16):
         if count < len(rooms):
-            chosen = [[everyone[(k + 1 + step) % len(rooms)] for step in range(count)] for k in range(len(rooms))]
+            chosen = [
+                [everyone[(k + 1 + step) % len(rooms)] for step in range(count)]
+                for k in range(len(rooms))
+            ]
             rows.append({"variant": f"{count} lessons alone"} | asked.figures(chosen, 0.0))
             name = f"{count} lessons and what ships"
             rows.append({"variant": name} | asked.figures(chosen, SHIPPED_WORTH))
@@ -60,7 +66,10 @@ def main(arguments: Sequence[str]) -> None:
     for points in (100, 300, 1000):
         marked = [asked.labelled(k, points) for k in range(len(rooms))]
         chosen = [[marked[(k + 1) % len(rooms)]] for k in range(len(rooms))]
-        rows.append({"variant": f"{points} labelled points of one scene, alone"} | asked.figures(chosen, 0.0))
+        rows.append(
+            {"variant": f"{points} labelled points of one scene, alone"}
+            | asked.figures(chosen, 0.0)
+        )
         name = f"{points} labelled points, and what ships"
         rows.append({"variant": name} | asked.figures(chosen, SHIPPED_WORTH))
     for row in rows:
@@ -71,7 +80,13 @@ def main(arguments: Sequence[str]) -> None:
 class Asked:
     """Scenes with their features of shape, and what maps of lessons say of them."""
 
-    def __init__(self, knowledge: Knowledge, rooms: list[Room], features: list[np.ndarray], classes: np.ndarray):
+    def __init__(
+        self,
+        knowledge: Knowledge,
+        rooms: list[Room],
+        features: list[np.ndarray],
+        classes: np.ndarray,
+    ):
         self.rooms, self.features, self.classes = rooms, features, classes
         self.shipped = mean_of([Sums(*of) for of in knowledge.shipped])
 
@@ -95,7 +110,9 @@ class Asked:
         room = self.rooms[scene]
         rows = np.flatnonzero(room.labels >= 0)
         share = 1 / np.sqrt(np.bincount(room.labels[rows])[room.labels[rows]])
-        rows = np.random.default_rng(scene).choice(rows, points, replace=False, p=share / share.sum())
+        rows = np.random.default_rng(scene).choice(
+            rows, points, replace=False, p=share / share.sum()
+        )
         weights = odds(np.full(points, 2), room.labels[rows])
         words = units(self.classes)[room.labels[rows]]
         return summed(self.features[scene][rows], np.concatenate([words, words], 1), weights)
@@ -108,6 +125,11 @@ class Asked:
             answers.append(z @ solved(whole, RIDGE).astype(np.float32))
         half, named = len(self.classes[0]), units(self.classes)
         pairs = list(zip(self.rooms, answers, strict=True))
-        both = [blend(room.features, effective(room.n_views), says[:, :half], K) for room, says in pairs]
+        both = [
+            blend(room.features, effective(room.n_views), says[:, :half], K) for room, says in pairs
+        ]
         shape = scores([says[:, half:] for says in answers], self.rooms, named)
-        return {"shape": f"{np.mean(shape):.1f}", "both": f"{np.mean(scores(both, self.rooms, self.classes)):.1f}"}
+        return {
+            "shape": f"{np.mean(shape):.1f}",
+            "both": f"{np.mean(scores(both, self.rooms, self.classes)):.1f}",
+        }

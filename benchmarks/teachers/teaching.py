@@ -1,10 +1,14 @@
-"""What an encoder of points owes to its transformers and its descriptors: error on rooms held out, against seconds.
+"""What an encoder of points owes to its transformers and its descriptors: error on rooms held out,
+against seconds.
 
-Rooms are made once and kept (--rooms-in). Variants are taught alike, with each seed, have as many features, and answer
-by the map that the rooms' lessons give in closed form. A figure is the mIoU of a room's points that some view sees,
-averaged over the rooms held out and the seeds: of shape alone, where depth shows the room, where few photos do, and
-where a sweep of its photos does; and of both, blended with the teacher's averages as in a scene whose training views
-ask for k = 2. In brackets the difference to pooling, with its 95 % interval over rooms.
+Rooms are made once and kept (--rooms-in). Variants are taught alike, with each seed, have as many
+features, and answer by the map that the rooms' lessons give in closed form. A figure is the mIoU of
+a room's points that some view sees,
+averaged over the rooms held out and the seeds: of shape alone, where depth shows the room, where
+  few photos do, and
+where a sweep of its photos does; and of both, blended with the teacher's averages as in a scene
+whose training views ask for k = 2. In brackets the difference to pooling, with its 95 % interval
+over rooms.
 """
 
 from __future__ import annotations
@@ -55,7 +59,9 @@ K = 2.0  # views that knowledge counts for
 KINDS = {"depth": 0, "few photos": 2, "swept": 3}  # of `rooms_of` that are measured
 
 
-def scores(features: Sequence[np.ndarray], rooms: Sequence[Room], embeddings: np.ndarray) -> list[float]:
+def scores(
+    features: Sequence[np.ndarray], rooms: Sequence[Room], embeddings: np.ndarray
+) -> list[float]:
     """mIoU, in per cent, of each room's features."""
     figures = []
     for values, room in zip(features, rooms, strict=True):
@@ -65,11 +71,17 @@ def scores(features: Sequence[np.ndarray], rooms: Sequence[Room], embeddings: np
     return figures
 
 
-def made(folder: Path, seeds: Sequence[int], settings: TeachSection, matrix: np.ndarray) -> list[list[Room]]:
+def made(
+    folder: Path, seeds: Sequence[int], settings: TeachSection, matrix: np.ndarray
+) -> list[list[Room]]:
     """The rooms of these seeds, as `rooms_of` gives them; kept in the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(torch.get_num_threads(), mp_context=get_context("spawn")) as pool:
-        list(pool.map(prepare, *zip(*((folder, seed, settings, matrix) for seed in seeds), strict=True)))
+        list(
+            pool.map(
+                prepare, *zip(*((folder, seed, settings, matrix) for seed in seeds), strict=True)
+            )
+        )
     return [held(folder, seed) for seed in seeds]
 
 
@@ -80,7 +92,12 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--held-out", type=int, default=8)
     parser.add_argument("--rooms-in", type=Path, default=Path("build/bench/teaching"))
-    parser.add_argument("--scenes", nargs="*", default=[], help="finished scenes of the teacher, to be measured in too")
+    parser.add_argument(
+        "--scenes",
+        nargs="*",
+        default=[],
+        help="finished scenes of the teacher, to be measured in too",
+    )
     parser.add_argument("--only", help="variants whose names hold this")
     options = parser.parse_args(arguments)
     knowledge, settings = read_knowledge(SHIPPED), TeachSection()
@@ -89,13 +106,17 @@ def main(arguments: Sequence[str]) -> None:
     rooms = made(options.rooms_in, seeds, settings, knowledge.matrix)
     tested = {name: [room[kind] for room in rooms[options.rooms :]] for name, kind in KINDS.items()}
     tested |= {name: [scene_room(name)] for name in options.scenes}
-    print(f"{options.steps} steps, seeds {options.seeds}, {options.rooms} rooms, {options.held_out} held out, "
+    print(f"{options.steps} steps, seeds {options.seeds}, {options.rooms} rooms, "
+          f"{options.held_out} held out, "
           f"{torch.get_num_threads()} threads, {shared.processor()}")  # fmt: skip
     rows: list[dict[str, Any]] = []
 
     def add(variant: str, measure: str, seed: int, seconds: float, values: Sequence[float]) -> None:
         more = {"seed": seed, "seconds": seconds}
-        rows.extend({"variant": variant, "measure": measure, "room": k, "miou": v} | more for k, v in enumerate(values))
+        rows.extend(
+            {"variant": variant, "measure": measure, "room": k, "miou": v} | more
+            for k, v in enumerate(values)
+        )
 
     for measure, of in tested.items():
         add("the teacher", measure, 0, 0.0, scores([room.features for room in of], of, embeddings))
@@ -103,12 +124,18 @@ def main(arguments: Sequence[str]) -> None:
         if options.only and options.only not in name and name != BASELINE:
             continue
         for seed in options.seeds:
-            encoder, found_map, seconds = taught(rooms[: options.rooms], variant, options.steps, embeddings, seed)
+            encoder, found_map, seconds = taught(
+                rooms[: options.rooms], variant, options.steps, embeddings, seed
+            )
             for measure, of in tested.items():
-                answers = [encoder.encode(room.inputs) @ found_map[:, : embeddings.shape[1]] for room in of]
+                answers = [
+                    encoder.encode(room.inputs) @ found_map[:, : embeddings.shape[1]] for room in of
+                ]
                 add(name, measure, seed, seconds, scores(answers, of, embeddings))
                 pairs = zip(of, answers, strict=True)
-                both = [blend(room.features, effective(room.n_views), says, K) for room, says in pairs]
+                both = [
+                    blend(room.features, effective(room.n_views), says, K) for room, says in pairs
+                ]
                 add(name, f"{measure}, both", seed, seconds, scores(both, of, embeddings))
         for text in lines(rows, name):
             print(text, flush=True)
@@ -118,13 +145,24 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def scene_room(name: str) -> Room:
-    """A finished scene's described points as a room: what its teacher says of each, and its true label."""
+    """A finished scene's described points as a room: what its teacher says of each, and its true
+    label.
+    """
     capture, points, features, described = (
         kind.read(artifact_of(name, stage))
-        for kind, stage in ((Capture, "ingest"), (Points, "sfm"), (Features, "teacher"), (Descriptors, "describe"))
+        for kind, stage in (
+            (Capture, "ingest"),
+            (Points, "sfm"),
+            (Features, "teacher"),
+            (Descriptors, "describe"),
+        )
     )
-    assert capture.labels is not None and capture.depth is not None and capture.class_names is not None
-    row, place = ({name: k for k, name in enumerate(names)} for names in (capture.names, features.names))
+    assert (
+        capture.labels is not None and capture.depth is not None and capture.class_names is not None
+    )
+    row, place = (
+        {name: k for k, name in enumerate(names)} for names in (capture.names, features.names)
+    )
     used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]]]
     depth = [capture.depth[row[points.names[k]]] for k in used]
     means, cameras = in_scene(described)[0], (points.Ks[used], points.cam_from_world[used])
@@ -136,7 +174,12 @@ def scene_room(name: str) -> Room:
     votes, _ = averaged(means, depth, truth, one_hot.shape[1], *cameras)
     labels = np.where(votes.argmax(1) < len(CLASS_NAMES), votes.argmax(1), -1)
     of = described
-    return Room(PointInputs(of.own, of.means, of.normals, of.descriptors, of.neighbors), mean, n_views, labels)
+    return Room(
+        PointInputs(of.own, of.means, of.normals, of.descriptors, of.neighbors),
+        mean,
+        n_views,
+        labels,
+    )
 
 
 def lines(rows: Sequence[dict[str, Any]], name: str) -> list[str]:
@@ -148,7 +191,9 @@ def lines(rows: Sequence[dict[str, Any]], name: str) -> list[str]:
     found_lines = [f"{name}, {np.mean([row['seconds'] for row in own]):.0f} s"]
     for measure in dict.fromkeys(row["measure"] for row in own):
         tested = sorted({row["room"] for row in own if row["measure"] == measure})
-        means, beside = ([float(np.mean(by[of, measure, room])) for room in tested] for of in (name, BASELINE))
+        means, beside = (
+            [float(np.mean(by[of, measure, room])) for room in tested] for of in (name, BASELINE)
+        )
         text = f"  {measure:24s} {np.mean(means):5.1f}"
         if name != BASELINE and (BASELINE, measure, 0) in by:
             apart = paired_difference(means, beside, [str(room) for room in tested])
@@ -160,7 +205,9 @@ def lines(rows: Sequence[dict[str, Any]], name: str) -> list[str]:
 def taught(
     rooms: list[list[Room]], variant: dict[str, Any], steps: int, embeddings: np.ndarray, seed: int
 ) -> tuple[PointEncoder, np.ndarray, float]:
-    """An encoder that was taught so in these rooms, the map of their lessons, and the seconds of teaching."""
+    """An encoder that was taught so in these rooms, the map of their lessons, and the seconds of
+    teaching.
+    """
     chosen = [room[kind] for kind in variant.get("kinds", (0, 1, 2, 3)) for room in rooms]
     examples = [example_of(room, embeddings) for room in chosen]
     torch.manual_seed(seed)

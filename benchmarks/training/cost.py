@@ -1,11 +1,13 @@
-"""What a training costs beside plain 3DGS; with --growth, how it grows with Gaussians, pixels and views.
+"""What a training costs beside plain 3DGS; with --growth, how it grows with Gaussians, pixels and
+views.
 
-The trainings take turns of fifty steps, so that other load on the machine meets all alike; a short training of each
-goes before, so that no kernel is left to compile.
+The trainings take turns of fifty steps, so that other load on the machine meets all alike; a short
+training of each goes before, so that no kernel is left to compile.
 
-Of growth, each case is a process of its own: some steps of the default training, colour and depth loss, on views of the
-scene that are enlarged and repeated, from as many points of its depth as Gaussians are wanted. Exponents are slopes of
-logarithms between the first and the last case of a row.
+Of growth, each case is a process of its own: some steps of the default training, colour and depth
+  loss, on views of the
+scene that are enlarged and repeated, from as many points of its depth as Gaussians are wanted.
+Exponents are slopes of logarithms between the first and the last case of a row.
 """
 
 from __future__ import annotations
@@ -45,11 +47,14 @@ BAR, TURN, REHEARSAL = 1.25, 50, 100
 BASE = (20_000, (320, 240), 60)  # Gaussians, pixels, views
 GROWTH = {
     "Gaussians": [(n, BASE[1], BASE[2]) for n in (20_000, 100_000, 400_000, 1_000_000)],
-    "pixels": [(BASE[0], size, BASE[2]) for size in ((320, 240), (640, 480), (1280, 960), (1920, 1080))],
+    "pixels": [
+        (BASE[0], size, BASE[2]) for size in ((320, 240), (640, 480), (1280, 960), (1920, 1080))
+    ],
     "views": [(*BASE[:2], n) for n in (60, 300, 1000)],
     "all": [(400_000, (1920, 1080), 1000)],
 }
-WARM, TIMED, BOUND = 10, 30, 6.0  # steps of a case before those that are timed, and these; gigabytes
+# steps of a case before those that are timed, and these; gigabytes
+WARM, TIMED, BOUND = 10, 30, 6.0
 
 
 def job_of(config: Config, inputs: dict[str, Path], device: str = "cpu") -> Job:
@@ -59,13 +64,17 @@ def job_of(config: Config, inputs: dict[str, Path], device: str = "cpu") -> Job:
 
 
 def trainer_from(work: Path, config: Config, backend: str = "auto", device: str = "cpu") -> Trainer:
-    """The train stage's trainer before its first step, of a scene that has been run up to its teacher.
+    """The train stage's trainer before its first step, of a scene that has been run up to its
+    teacher.
 
-    Args: work: folder of the links `ingest`, `sfm` and, if semantics are trained, `teacher`; backend: of the
+    Args: work: folder of the links `ingest`, `sfm` and, if semantics are trained, `teacher`;
+      backend: of the
           rasterizer; device: `cpu` or `cuda`.
     """
     inputs = {"capture": work / "ingest", "points": work / "sfm"}
-    job = job_of(config, inputs | ({"features": work / "teacher"} if config.train.semantics else {}), device)
+    job = job_of(
+        config, inputs | ({"features": work / "teacher"} if config.train.semantics else {}), device
+    )
     return assemble(job, read_inputs(job), backend)
 
 
@@ -75,7 +84,9 @@ def begun(work: Path, ablation: str, steps: int) -> Trainer:
 
 
 def by_turns(work: Path, variants: Sequence[str], n_steps: int) -> dict[str, float]:
-    """Milliseconds a step of whole trainings, as a multiple of the first variant's, which is returned."""
+    """Milliseconds a step of whole trainings, as a multiple of the first variant's, which is
+    returned.
+    """
     for name in variants:
         for _ in begun(work, name, REHEARSAL).steps():
             pass
@@ -89,9 +100,17 @@ def by_turns(work: Path, variants: Sequence[str], n_steps: int) -> dict[str, flo
             print(f"after {min(done + TURN, n_steps)} steps")
             for name, trainer in trainers.items():
                 ratio = trainer.seconds / trainers[variants[0]].seconds
-                parts = "  ".join(f"{part} {1e3 * s / trainer.step:.1f}" for part, s in trainer.laps.seconds.items())
-                print(f"  {name:12s} {1e3 * trainer.seconds / trainer.step:6.1f} ms a step  ×{ratio:.2f}  {parts}")
-    return {name: trainer.seconds / trainers[variants[0]].seconds for name, trainer in trainers.items()}
+                parts = "  ".join(
+                    f"{part} {1e3 * s / trainer.step:.1f}"
+                    for part, s in trainer.laps.seconds.items()
+                )
+                print(
+                    f"  {name:12s} {1e3 * trainer.seconds / trainer.step:6.1f} ms a step  "
+                    f"×{ratio:.2f}  {parts}"
+                )
+    return {
+        name: trainer.seconds / trainers[variants[0]].seconds for name, trainer in trainers.items()
+    }
 
 
 def enlarged(work: Path, size: tuple[int, int], n_views: int, out: Path) -> Path:
@@ -107,25 +126,36 @@ def enlarged(work: Path, size: tuple[int, int], n_views: int, out: Path) -> Path
         images[k] = given.images[view][rows[:, None], columns]
         depth[k] = given.depth[view][rows[:, None], columns]
     Ks = given.Ks[used] * np.array([[size[0] / given.size[0]], [size[1] / given.size[1]], [1.0]])
-    nothing: dict[str, Any] = {"labels": None, "loss_mask": None, "pseudo_labels": None, "confidence": None}
+    nothing: dict[str, Any] = {
+        "labels": None,
+        "loss_mask": None,
+        "pseudo_labels": None,
+        "confidence": None,
+    }
     capture = replace(
         given, names=[f"view{k:04d}" for k in range(n_views)], images=images, depth=depth, Ks=Ks,
         cam_from_world=given.cam_from_world[used], is_test=np.zeros(n_views, bool), **nothing,
     )  # fmt: skip
     folder = out / "capture"
-    with artifact.publish(folder, Manifest(Capture.SCHEMA, artifact.digest({"case": str(out)}), "ingest")) as tmp:
+    with artifact.publish(
+        folder, Manifest(Capture.SCHEMA, artifact.digest({"case": str(out)}), "ingest")
+    ) as tmp:
         capture.write(tmp)
     return folder
 
 
 def measured(capture: Path, n_gaussians: int, device: str = "cpu") -> dict[str, float]:
-    """What a training of this process takes; nothing else is to be in its memory, which on a GPU is its tensors'."""
+    """What a training of this process takes; nothing else is to be in its memory, which on a GPU is
+    its tensors'.
+    """
     held, rng = Capture.read(capture), np.random.default_rng(0)
     assert held.cam_from_world is not None and held.depth is not None
     views = np.linspace(0, len(held.names) - 1, 60).astype(int)
     means, colors = [], []
     for view in views:
-        pixels = np.stack([rng.integers(0, side, n_gaussians // len(views) + 1) for side in held.size[::-1]], 1)
+        pixels = np.stack(
+            [rng.integers(0, side, n_gaussians // len(views) + 1) for side in held.size[::-1]], 1
+        )
         means.append(unproject(held.depth[view], held.Ks[view], held.cam_from_world[view], pixels))
         colors.append(held.images[view][pixels[:, 0], pixels[:, 1]])
     places = np.concatenate(means)[:n_gaussians] + rng.normal(0, 1e-4, (n_gaussians, 3))
@@ -134,7 +164,12 @@ def measured(capture: Path, n_gaussians: int, device: str = "cpu") -> dict[str, 
         held.names, held.Ks, held.cam_from_world, places, np.concatenate(colors)[:n_gaussians], normals, shapes,
         np.zeros((0, 2), np.int32), {"how": "depth"},
     )  # fmt: skip
-    settings = {"steps": 3000, "semantics": False, "max_gaussians": 2 * n_gaussians, "weight_depth": 0.8}
+    settings = {
+        "steps": 3000,
+        "semantics": False,
+        "max_gaussians": 2 * n_gaussians,
+        "weight_depth": 0.8,
+    }
     config = Config.model_validate({"train": settings})
     trainer = assemble(job_of(config, {}, device), Inputs(held, points))
     trainer.step = int(config.train.steps * 0.1)  # at full resolution, before growth
@@ -165,15 +200,25 @@ def growth(work: Path, names: Sequence[str], out: Path) -> int:
                 command = [sys.executable, "-m", "benchmarks", "cost", "--work", str(work)]
                 command += ["--case", str(capture), str(n_gaussians)]
                 done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
-            row = {"row": name, "gaussians": n_gaussians, "width": size[0], "height": size[1], "views": n_views}
+            row = {
+                "row": name,
+                "gaussians": n_gaussians,
+                "width": size[0],
+                "height": size[1],
+                "views": n_views,
+            }
             rows.append(row | json.loads(done.stdout) | {"disk_gb": stored / 2**30})
-            print("{gaussians:>9,} Gaussians  {width:>4}×{height:<4}  {views:>4} views  {step_ms:7.1f} ms a step  "
+            print("{gaussians:>9,} Gaussians  {width:>4}×{height:<4}  {views:>4} views  "
+                  "{step_ms:7.1f} ms a step  "
                   "{peak_gb:5.2f} GB  {disk_gb:6.3f} GB on disk".format(**rows[-1]), flush=True)  # fmt: skip
         first, last = ([row for row in rows if row["row"] == name][k] for k in (0, -1))
         if first is not last:
             grown = {"Gaussians": last["gaussians"] / first["gaussians"], "views": last["views"] / first["views"],
                      "pixels": last["width"] * last["height"] / (first["width"] * first["height"])}[name]  # fmt: skip
-            slopes = (math.log(last[key] / first[key]) / math.log(grown) for key in ("step_ms", "peak_gb", "disk_gb"))
+            slopes = (
+                math.log(last[key] / first[key]) / math.log(grown)
+                for key in ("step_ms", "peak_gb", "disk_gb")
+            )
             print("with {}: step ^{:.2f}, memory ^{:.2f}, disk ^{:.2f}".format(name, *slopes))
     shared.write_csv(out / "growth.csv", rows)
     return int(any(row["peak_gb"] > BOUND for row in rows if row["views"] == 1000))

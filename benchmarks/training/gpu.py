@@ -1,10 +1,12 @@
 """office0 trained on a GPU, beside the CPU and beside plain 3DGS through gsplat.
 
-Rows of gpu.csv: a training each, with its seconds, PSNR and mIoU on the test views, and the most memory that tensors
-have taken until then; frames a second of our scene by this project's renderer and of plain 3DGS by gsplat's own, by
-turns, the images copied back. Then the launches of a step, by the profiler; one step of scenes of 20,000, 200,000 and
-1,000,000 Gaussians, ours, and gsplat's own with and without packing; one of large photos; and a short training twice:
-gsplat adds gradients up in the order in which threads arrive.
+Rows of gpu.csv: a training each, with its seconds, PSNR and mIoU on the test views, and the most
+  memory that tensors
+have taken until then; frames a second of our scene by this project's renderer and of plain 3DGS by
+gsplat's own, by turns, the images copied back. Then the launches of a step, by the profiler; one
+step of scenes of 20,000, 200,000 and 1,000,000 Gaussians, ours, and gsplat's own with and without
+packing; one of large photos; and a short training twice: gsplat adds gradients up in the order in
+which threads arrive.
 """
 
 from __future__ import annotations
@@ -47,7 +49,13 @@ STEPS = 300  # of the training that is repeated
 SIZES = (20_000, 200_000, 1_000_000)
 LARGE = (500_000, (1336, 1000), 200)  # Gaussians, pixels, views
 WIDTH, HEIGHT, CHANNELS = 640, 480, 16
-LAUNCHES = ("cudaLaunchKernel", "cuLaunchKernel", "cudaGraphLaunch", "cudaMemcpyAsync", "cudaMemsetAsync")
+LAUNCHES = (
+    "cudaLaunchKernel",
+    "cuLaunchKernel",
+    "cudaGraphLaunch",
+    "cudaMemcpyAsync",
+    "cudaMemsetAsync",
+)
 BARS = {"seconds": 15.0, "twice the steps": 30.0, "frames": 1.5, "launches": 60}
 
 
@@ -62,7 +70,10 @@ def main(arguments: Sequence[str]) -> int:
 
     def add(row: dict[str, Any]) -> None:
         rows.append(row)
-        shown = ((key, f"{value:.5g}" if isinstance(value, float) else value) for key, value in row.items())
+        shown = (
+            (key, f"{value:.5g}" if isinstance(value, float) else value)
+            for key, value in row.items()
+        )
         print("  ".join(f"{key} {value}" for key, value in shown), flush=True)
         shared.write_csv(options.out / "gpu.csv", rows)  # what was measured stays, whatever comes
 
@@ -72,7 +83,9 @@ def main(arguments: Sequence[str]) -> int:
             found[name] = trained(options.work, Path(folder) / name, name, ablation, steps, device)
             add(found[name])
         on_gpu, longer, on_cpu, _ = (found[name] for name in RUNS)
-        ours, plain = (Scene.read(Path(folder) / name / "export") for name in ("GPU", "plain 3DGS, GPU"))
+        ours, plain = (
+            Scene.read(Path(folder) / name / "export") for name in ("GPU", "plain 3DGS, GPU")
+        )
         frames = by_turns({"ours": by_ours(ours), "plain": by_gsplat(plain)}, views_of(ours))
         add(frames)
         launched = launches(options.work)
@@ -88,9 +101,11 @@ def main(arguments: Sequence[str]) -> int:
         "PSNR as on the CPU, to 0.1 dB": abs(on_gpu["psnr"] - on_cpu["psnr"]) <= 0.1,
         "mIoU as on the CPU, to 0.5 points": abs(on_gpu["miou"] - on_cpu["miou"]) <= 0.005,
         f"1500 steps in {BARS['seconds']:g} s": on_gpu["seconds"] <= BARS["seconds"],
-        f"3000 steps in {BARS['twice the steps']:g} s": longer["seconds"] <= BARS["twice the steps"],
+        f"3000 steps in {BARS['twice the steps']:g} s": longer["seconds"]
+        <= BARS["twice the steps"],
         f"{BARS['launches']} launches a step": launched["launches"] <= BARS["launches"],
-        f"{BARS['frames']} times plain 3DGS's frames": frames["ours"] >= BARS["frames"] * frames["plain"],
+        f"{BARS['frames']} times plain 3DGS's frames": frames["ours"]
+        >= BARS["frames"] * frames["plain"],
         "a training repeats to 0.1 dB": abs(repeated["psnr"] - repeated["psnr_before"]) <= 0.1,
     }
     for bar, holds in bars.items():
@@ -98,19 +113,31 @@ def main(arguments: Sequence[str]) -> int:
     return 0 if all(bars.values()) else 1
 
 
-def trained(work: Path, out: Path, name: str, ablation: str, steps: int, device: str) -> dict[str, Any]:
-    """A training's row: from a scene that is there up to its teacher to its evaluation, in this process."""
+def trained(
+    work: Path, out: Path, name: str, ablation: str, steps: int, device: str
+) -> dict[str, Any]:
+    """A training's row: from a scene that is there up to its teacher to its evaluation, in this
+    process.
+    """
     values = read_toml("ablations", ablation) if ablation else {}
     config = out.with_suffix(".json")
     config.write_text(json.dumps(values | {"train": values.get("train", {}) | {"steps": steps}}))
-    features = {} if values.get("train", {}).get("semantics") is False else {"features": work / "teacher"}
+    features = (
+        {} if values.get("train", {}).get("semantics") is False else {"features": work / "teacher"}
+    )
     stages = (
         ("train", train.run, {"capture": work / "ingest", "points": work / "sfm"} | features),
         ("export", export.run, {"gaussians": out / "train"} | features),
-        ("evaluate", evaluate.run, {"capture": work / "ingest", "scene": out / "export"} | features),
+        (
+            "evaluate",
+            evaluate.run,
+            {"capture": work / "ingest", "scene": out / "export"} | features,
+        ),
     )
     for stage, run, inputs in stages:
-        publish(stage, run, out / stage, inputs, config, device="cpu" if stage == "export" else device)
+        publish(
+            stage, run, out / stage, inputs, config, device="cpu" if stage == "export" else device
+        )
     figures = json.loads((out / "evaluate" / "figures.json").read_text())
     facts = read_manifest(out / "train").facts
     segmentation = figures.get("segmentation")
@@ -129,12 +156,19 @@ def trained(work: Path, out: Path, name: str, ablation: str, steps: int, device:
 def views_of(scene: Scene) -> list[View]:
     cameras = scene.cameras
     return [
-        View(torch.tensor(K).float().to(DEVICE), torch.tensor(pose).float().to(DEVICE), cameras.width, cameras.height)
+        View(
+            torch.tensor(K).float().to(DEVICE),
+            torch.tensor(pose).float().to(DEVICE),
+            cameras.width,
+            cameras.height,
+        )
         for K, pose in zip(cameras.Ks, cameras.cam_from_world, strict=True)
     ]
 
 
-def by_turns(renderers: dict[str, Callable[[View], np.ndarray]], views: list[View]) -> dict[str, Any]:
+def by_turns(
+    renderers: dict[str, Callable[[View], np.ndarray]], views: list[View]
+) -> dict[str, Any]:
     """Frames a second over all views by each renderer, the best of REPEATS rounds in turn."""
     seconds: dict[str, list[float]] = {name: [] for name in renderers}
     for _ in range(1 + REPEATS):  # the first loads
@@ -156,9 +190,18 @@ def by_gsplat(scene: Scene) -> Callable[[View], np.ndarray]:
     """A scene as gsplat itself renders it, all SH bands of all Gaussians."""
     import gsplat
 
-    raw = {name: torch.from_numpy(np.ascontiguousarray(value)).to(DEVICE) for name, value in scene.parameters.items()}
+    raw = {
+        name: torch.from_numpy(np.ascontiguousarray(value)).to(DEVICE)
+        for name, value in scene.parameters.items()
+    }
     coefficients = torch.cat([raw["sh0"], raw["shN"]], 1)
-    gaussians = raw["means"], raw["quats"], raw["log_scales"].exp(), raw["logit_opacities"].sigmoid(), coefficients
+    gaussians = (
+        raw["means"],
+        raw["quats"],
+        raw["log_scales"].exp(),
+        raw["logit_opacities"].sigmoid(),
+        coefficients,
+    )
     degree = round(coefficients.shape[1] ** 0.5) - 1
 
     @torch.no_grad()
@@ -172,8 +215,12 @@ def by_gsplat(scene: Scene) -> Callable[[View], np.ndarray]:
 
 
 def launches(work: Path) -> dict[str, Any]:
-    """Launches of a step that are not gsplat's, and milliseconds of a step and of its kernels, once growth is over."""
-    trainer = trainer_from(work, Config(train=TrainSection(steps=STEPS, densify_until=0.3)), device=DEVICE)
+    """Launches of a step that are not gsplat's, and milliseconds of a step and of its kernels, once
+    growth is over.
+    """
+    trainer = trainer_from(
+        work, Config(train=TrainSection(steps=STEPS, densify_until=0.3)), device=DEVICE
+    )
     steps = trainer.steps()
     n_steps = 8  # a round of what is taught and when
     while trainer.step < 0.7 * STEPS // n_steps * n_steps:
@@ -210,17 +257,27 @@ def launches_of_gsplat(trainer: Trainer) -> float:
     raw = trainer.model.raw
     n, view = len(trainer.model), trainer.views.camera(0, 1)
     colors = torch.rand(n, 3 + raw["features"].shape[1] if "features" in raw else 3, device=DEVICE)
-    leaves = [raw["means"], raw["quats"], raw["log_scales"].exp(), raw["logit_opacities"].sigmoid(), colors]
+    leaves = [
+        raw["means"],
+        raw["quats"],
+        raw["log_scales"].exp(),
+        raw["logit_opacities"].sigmoid(),
+        colors,
+    ]
     leaves = [leaf.detach().requires_grad_(True) for leaf in leaves]
     camera = view.viewmat[None], view.K[None], view.width, view.height
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
         image, alpha, _ = rasterize(*leaves, *camera, backend="cuda", harmless=True)
         torch.autograd.backward([image, alpha], [torch.ones_like(image), torch.ones_like(alpha)])
-    return float(sum(call.count for call in profile.key_averages() if call.key.startswith(LAUNCHES)) - 2)  # of ones
+    # of ones
+    return float(
+        sum(call.count for call in profile.key_averages() if call.key.startswith(LAUNCHES)) - 2
+    )
 
 
 def step(n: int, packed: bool | None) -> dict[str, Any]:
-    """Seconds and peak bytes of one rendering of n Gaussians at 640×480 in 16 channels, forward and backward.
+    """Seconds and peak bytes of one rendering of n Gaussians at 640×480 in 16 channels, forward and
+    backward.
 
     Args: packed: None renders as a training does; otherwise gsplat itself does, packed or not.
     """
@@ -252,29 +309,45 @@ def step(n: int, packed: bool | None) -> dict[str, Any]:
         "device": torch.cuda.get_device_name(),
         "gaussians": n,
     }
-    return row | {"seconds": float(np.median(seconds[1:])), "peak_bytes": torch.cuda.max_memory_allocated()}
+    return row | {
+        "seconds": float(np.median(seconds[1:])),
+        "peak_bytes": torch.cuda.max_memory_allocated(),
+    }
 
 
 def large(work: Path, folder: Path) -> dict[str, Any]:
-    """A step of many Gaussians and large photos, colour and depth, and its memory: of `benchmarks cost --growth`."""
+    """A step of many Gaussians and large photos, colour and depth, and its memory: of `benchmarks
+    cost --growth`.
+    """
     n, size, n_views = LARGE
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
     figures = cost.measured(cost.enlarged(work, size, n_views, folder / "large"), n, DEVICE)
     what = f"{n} Gaussians, {n_views} photos of {size[0]}×{size[1]}, a step"
     row = {"what": what, "device": torch.cuda.get_device_name(), "gaussians": n}
-    return row | {"seconds": figures["step_ms"] / 1e3, "peak_bytes": round(figures["peak_gb"] * 2**30)}
+    return row | {
+        "seconds": figures["step_ms"] / 1e3,
+        "peak_bytes": round(figures["peak_gb"] * 2**30),
+    }
 
 
 def again(work: Path) -> dict[str, Any]:
-    """What two trainings of STEPS steps on the GPU have in common: PSNR of both, and whether bytes are the same."""
+    """What two trainings of STEPS steps on the GPU have in common: PSNR of both, and whether bytes
+    are the same.
+    """
     trainings = []
     for _ in range(2):
         trainer = trainer_from(work, Config(train=TrainSection(steps=STEPS)), device=DEVICE)
         for _ in trainer.steps():
             pass
-        trainings.append((trainer.held_in_psnr(list(range(0, len(trainer.views.names), 8))), trainer.finish()))
+        trainings.append(
+            (trainer.held_in_psnr(list(range(0, len(trainer.views.names), 8))), trainer.finish())
+        )
     (first, a), (second, b) = trainings
     same = all(np.array_equal(a[name], b[name]) for name in a)
-    row = {"what": "the same training again", "device": torch.cuda.get_device_name(), "psnr": second}
+    row = {
+        "what": "the same training again",
+        "device": torch.cuda.get_device_name(),
+        "psnr": second,
+    }
     return row | {"psnr_before": first, "same_bytes": same}

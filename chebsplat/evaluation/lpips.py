@@ -10,9 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, relu
 
-NET, NORMALIZE = "vgg", False  # recorded with every figure: "alex", or images scaled to [-1, 1], is another number
+# recorded with every figure: "alex", or images scaled to [-1, 1], is another number
+NET, NORMALIZE = "vgg", False
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # LPIPS' own, of images in [-1, 1]
-# Channels of the 13 convolutions by their number among VGG's layers; taps follow the last of each line.
+# Channels of the 13 convolutions by their number among VGG's layers; taps follow the last of each
+# line.
 BLOCKS = (
     {0: 64, 2: 64},
     {5: 128, 7: 128},
@@ -28,8 +30,8 @@ class Lpips:
     """The distance of two images, 0 for equal ones."""
 
     def __init__(self, state: Mapping[str, Tensor]):
-        """Args: state: tensors by name, as torchvision's VGG-16 (`features.N`), the lpips package's `LPIPS` or
-          3DGS' copy of it name them; taps `linK.model.1.weight`.
+        """Args: state: tensors by name, as torchvision's VGG-16 (`features.N`), the lpips package's
+          `LPIPS` or 3DGS' copy of it name them; taps `linK.model.1.weight`.
         Raises: ValueError naming the first tensor that is missing or of another shape.
         """
         tensors: dict[tuple[str, int], Tensor] = {}
@@ -42,11 +44,16 @@ class Lpips:
         wanted: dict[tuple[str, int], tuple[int, ...]] = {}
         for k, block in enumerate(BLOCKS):
             for layer, channels in block.items():
-                wanted["weight", layer], wanted["bias", layer] = (channels, before, 3, 3), (channels,)
+                wanted["weight", layer], wanted["bias", layer] = (
+                    (channels, before, 3, 3),
+                    (channels,),
+                )
                 before = channels
             wanted["tap", k] = (1, before, 1, 1)
         for key, shape in wanted.items():
-            title = f"lin{key[1]}.model.1.weight" if key[0] == "tap" else f"features.{key[1]}.{key[0]}"
+            title = (
+                f"lin{key[1]}.model.1.weight" if key[0] == "tap" else f"features.{key[1]}.{key[0]}"
+            )
             if key not in tensors:
                 raise ValueError(f"no tensor {title}")
             if tuple(tensors[key].shape) != shape:
@@ -74,7 +81,9 @@ class Lpips:
         for k, block in enumerate(BLOCKS):
             x = max_pool2d(x, 2) if k else x
             for layer in block:
-                x = relu(conv2d(x, self.tensors["weight", layer], self.tensors["bias", layer], padding=1))
+                x = relu(
+                    conv2d(x, self.tensors["weight", layer], self.tensors["bias", layer], padding=1)
+                )
             taps.append(x)
         return taps
 

@@ -35,19 +35,27 @@ def psnr(image: np.ndarray, truth: np.ndarray) -> float:
     Raises: ValueError unless both are u8 of one shape: PSNR on floats is another number.
     """
     if image.dtype != np.uint8 or truth.dtype != np.uint8 or image.shape != truth.shape:
-        raise ValueError(f"two u8 images of one shape are needed, not {image.dtype} {image.shape}, {truth.shape}")
+        raise ValueError(
+            f"two u8 images of one shape are needed, not {image.dtype} {image.shape}, {truth.shape}"
+        )
     error = np.mean((image.astype(np.float64) - truth) ** 2)
     return float(10 * np.log10(255**2 / error)) if error > 0 else float("inf")
 
 
 def color_fitted(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """The image u8 [..., 3] in the affine map of its colours that is nearest to the truth u8 [..., 3], u8.
+    """The image u8 [..., 3] in the affine map of its colours that is nearest to the truth u8 [...,
+    3], u8.
 
-    Choices: least squares over all pixels, 12 numbers; then rounded and cut off to 8 bits, as any picture.
+    Choices: least squares over all pixels, 12 numbers; then rounded and cut off to 8 bits, as any
+      picture.
     """
     colors = np.concatenate([image.reshape(-1, 3) / 255, np.ones((image.size // 3, 1))], 1)
-    weights = np.linalg.lstsq(colors.T @ colors, colors.T @ (truth.reshape(-1, 3) / 255), rcond=1e-9)[0]
-    fitted: np.ndarray = (255 * colors @ weights).round().clip(0, 255).astype(np.uint8).reshape(image.shape)
+    weights = np.linalg.lstsq(
+        colors.T @ colors, colors.T @ (truth.reshape(-1, 3) / 255), rcond=1e-9
+    )[0]
+    fitted: np.ndarray = (
+        (255 * colors @ weights).round().clip(0, 255).astype(np.uint8).reshape(image.shape)
+    )
     return fitted
 
 
@@ -60,9 +68,13 @@ def confusion(labels: np.ndarray, truth: np.ndarray, n_classes: int) -> np.ndarr
         raise ValueError(f"shapes disagree: {labels.shape}, {truth.shape}")
     counted = truth != IGNORE
     rows, columns = truth[counted].astype(np.int64), labels[counted].astype(np.int64)
-    if len(rows) and (min(rows.min(), columns.min()) < 0 or max(rows.max(), columns.max()) >= n_classes):
+    if len(rows) and (
+        min(rows.min(), columns.min()) < 0 or max(rows.max(), columns.max()) >= n_classes
+    ):
         raise ValueError(f"a label lies outside 0...{n_classes - 1}")
-    return np.bincount(rows * n_classes + columns, minlength=n_classes**2).reshape(n_classes, n_classes)
+    return np.bincount(rows * n_classes + columns, minlength=n_classes**2).reshape(
+        n_classes, n_classes
+    )
 
 
 def segmentation(matrix: np.ndarray) -> Segmentation:
@@ -81,7 +93,9 @@ def segmentation(matrix: np.ndarray) -> Segmentation:
 
 
 def boundary_band(truth: np.ndarray, half_width: int) -> np.ndarray:
-    """Pixels [H, W] within `half_width` pixels (chessboard) of a pixel with another label, IGNORE edges not counted."""
+    """Pixels [H, W] within `half_width` pixels (chessboard) of a pixel with another label, IGNORE
+    edges not counted.
+    """
     edge = np.zeros(truth.shape, bool)
     for axis in (0, 1):
         ahead, behind = np.moveaxis(truth, axis, 0)[1:], np.moveaxis(truth, axis, 0)[:-1]
@@ -89,7 +103,9 @@ def boundary_band(truth: np.ndarray, half_width: int) -> np.ndarray:
         view = np.moveaxis(edge, axis, 0)
         view[1:] |= differs
         view[:-1] |= differs
-    return binary_dilation(edge, np.ones((2 * half_width - 1,) * 2, bool)) if half_width > 1 else edge
+    return (
+        binary_dilation(edge, np.ones((2 * half_width - 1,) * 2, bool)) if half_width > 1 else edge
+    )
 
 
 def features_at(
@@ -100,15 +116,17 @@ def features_at(
     opacities: np.ndarray,
     features: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of the features of all Gaussians at each point, weighted by opacity times density relative to its peak.
+    """Mean of the features of all Gaussians at each point, weighted by opacity times density
+    relative to its peak.
 
     Args:
       points:    [M, 3] scene units.
-      means:     [N, 3]; quats [N, 4] wxyz of any length; scales [N, 3] standard deviations; opacities [N] in (0, 1).
+      means:     [N, 3]; quats [N, 4] wxyz of any length; scales [N, 3] standard deviations;
+        opacities [N] in (0, 1).
       features:  [N, C].
     Returns: features f32 [M, C], zero where no Gaussian reaches; weights f32 [M], their sums.
-    Choices: a Gaussian ends at 3 standard deviations. Nothing occludes anything: what lies in front of a point or
-      behind it by more than that has no say.
+    Choices: a Gaussian ends at 3 standard deviations. Nothing occludes anything: what lies in front
+      of a point or behind it by more than that has no say.
     """
     sums, weights = np.zeros((len(points), features.shape[1])), np.zeros(len(points))
     if not len(points) or not len(means):
@@ -121,7 +139,10 @@ def features_at(
         row = np.repeat(np.arange(len(near)), [len(indices) for indices in near])
         point = np.fromiter((k for indices in near for k in indices), np.int64, len(row))
         gaussian = row + start
-        local = np.einsum("pi,pij->pj", points[point] - means[gaussian], axes[gaussian]) / scales[gaussian]
+        local = (
+            np.einsum("pi,pij->pj", points[point] - means[gaussian], axes[gaussian])
+            / scales[gaussian]
+        )
         squared = (local**2).sum(1)
         weight = np.where(squared <= REACH**2, opacities[gaussian] * np.exp(-0.5 * squared), 0.0)
         matrix = coo_matrix((weight, (point, row)), (len(points), len(near))).tocsr()
@@ -132,10 +153,11 @@ def features_at(
 
 
 def thinned(points: np.ndarray) -> np.ndarray:
-    """Which of points [M, 3] are kept: the first of each cell, so that an area counts as often as it is large.
+    """Which of points [M, 3] are kept: the first of each cell, so that an area counts as often as
+    it is large.
 
-    Choices: 128 cells along the longest side of the box that holds 98 % of the points along each axis; a stray depth
-      beyond it does not coarsen them.
+    Choices: 128 cells along the longest side of the box that holds 98 % of the points along each
+      axis; a stray depth beyond it does not coarsen them.
     """
     if not len(points):
         return np.zeros(0, np.int64)

@@ -1,4 +1,6 @@
-"""Means with their spread, and paired differences with an interval: what a study reports of its runs."""
+"""Means with their spread, and paired differences with an interval: what a study reports of its
+runs.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,11 @@ class Summary:
 
 @dataclass(frozen=True)
 class Difference:
-    """A mean paired difference (or ratio), its spread over pairs, and the 95 % interval of the mean.
+    """A mean paired difference (or ratio), its spread over pairs, and the 95 % interval of the
+    mean.
 
-    `low`, `high`, `error` are nan with a single unit: then nothing can be said about other scenes or seeds.
+    `low`, `high`, `error` are nan with a single unit: then nothing can be said about other scenes
+      or seeds.
     """
 
     mean: float
@@ -45,29 +49,44 @@ class Difference:
 
 
 def summarize(values: Values) -> Summary:
-    """Mean ± sample standard deviation of values [N]. Raises ValueError on none, or on a value that is not finite."""
+    """Mean ± sample standard deviation of values [N]. Raises ValueError on none, or on a value that
+    is not finite.
+    """
     values = _finite(values)
-    return Summary(float(values.mean()), float(values.std(ddof=1)) if len(values) > 1 else float("nan"), len(values))
+    return Summary(
+        float(values.mean()),
+        float(values.std(ddof=1)) if len(values) > 1 else float("nan"),
+        len(values),
+    )
 
 
-def paired_difference(values: Values, baseline: Values, scenes: list[str], ratio: bool = False) -> Difference:
+def paired_difference(
+    values: Values, baseline: Values, scenes: list[str], ratio: bool = False
+) -> Difference:
     """values − baseline (or values / baseline) over pairs of the same scene and seed.
 
-    Args: values, baseline [N], the same scene and seed at each index; scenes: N names; ratio: positive values whose
-      quotient is meant; the mean is then geometric.
-    Raises: ValueError on no pair, lengths that disagree, a value that is not finite, or a ratio of one that is not > 0.
-    Choices: seeds of one scene are not independent of each other, so the interval is Student's over the scenes' means;
-      with one scene it is over the seeds, and says nothing about other scenes. `error` and `spread` of a ratio are of
-      its logarithm, that is, relative.
+    Args: values, baseline [N], the same scene and seed at each index; scenes: N names; ratio:
+      positive values whose quotient is meant; the mean is then geometric.
+    Raises: ValueError on no pair, lengths that disagree, a value that is not finite, or a ratio of
+      one that is not > 0.
+    Choices: seeds of one scene are not independent of each other, so the interval is Student's over
+      the scenes' means; with one scene it is over the seeds, and says nothing about other scenes.
+      `error` and `spread` of a ratio are of its logarithm, that is, relative.
     """
     values, baseline = _finite(values), _finite(baseline)
     if not len(values) == len(baseline) == len(scenes):
-        raise ValueError(f"{len(values)} values, {len(baseline)} of the baseline, {len(scenes)} scenes")
+        raise ValueError(
+            f"{len(values)} values, {len(baseline)} of the baseline, {len(scenes)} scenes"
+        )
     if ratio and min(values.min(), baseline.min()) <= 0:
         raise ValueError("a ratio needs values > 0")
     steps = np.log(values) - np.log(baseline) if ratio else values - baseline
     names = sorted(set(scenes))
-    units = np.array([steps[[s == name for s in scenes]].mean() for name in names]) if len(names) > 1 else steps
+    units = (
+        np.array([steps[[s == name for s in scenes]].mean() for name in names])
+        if len(names) > 1
+        else steps
+    )
     mean, n = float(units.mean()), len(units)
     error = float(units.std(ddof=1) / np.sqrt(n)) if n > 1 else float("nan")
     reach = quantile(n - 1) * error if n > 1 else float("nan")

@@ -1,4 +1,6 @@
-"""What compiled kernels are made of: numba's settings and its cache (`jit`), and explicit vectors (`simd`).
+"""What compiled kernels are made of: numba's settings and its cache (`jit`), and explicit vectors
+(`simd`).
 
-A vector is 16 float32, of a contiguous array and an index into it as if it were flat. Imports nothing of chebsplat.
+A vector is 16 float32, of a contiguous array and an index into it as if it were flat. Imports
+nothing of chebsplat.
 """

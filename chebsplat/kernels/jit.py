@@ -1,7 +1,8 @@
-"""The door to numba: how kernels are compiled, where they are kept, and the memory that they work in.
+"""The door to numba: how kernels are compiled, where they are kept, and the memory that they work
+in.
 
-The folder is named for our kernels' source, so that an edited helper is never served stale. It lies in the user's
-cache; CHEBSPLAT_CACHE moves it.
+The folder is named for our kernels' source, so that an edited helper is never served stale. It lies
+in the user's cache; CHEBSPLAT_CACHE moves it.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ KEPT = {-3: 32 << 20, -1: 64 << 20}  # bytes, by malloc.h's M_MMAP_THRESHOLD and
 
 
 def _keep_freed_memory() -> None:
-    """Let a step's arrays take what the last step's left: memory that went back to the system comes page by page, which
-    is a third of a small step's time. Only glibc is asked, and what the user says to it is left alone.
+    """Let a step's arrays take what the last step's left: memory that went back to the system comes
+    page by page, which is a third of a small step's time. Only glibc is asked, and what the user
+    says to it is left alone.
     """
     if any(name in os.environ for name in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")):
         return
@@ -43,18 +45,27 @@ def _keep_freed_memory() -> None:
 def _digest() -> str:
     """Of our kernels' source."""
     sources = [path.read_bytes() for path in sorted(ROOT.rglob("*.py"))]
-    text = b"".join(source for source in sources if b"numba" in source or b"chebsplat.kernels.jit" in source)
+    text = b"".join(
+        source for source in sources if b"numba" in source or b"chebsplat.kernels.jit" in source
+    )
     return hashlib.sha256(text).hexdigest()[:16]
 
 
 def _folders() -> list[Path]:
     """Folders for compiled kernels, the best first."""
     name = f"numba-{DIGEST}"
-    chosen, cache, work = (os.environ.get(key) for key in ("CHEBSPLAT_CACHE", "XDG_CACHE_HOME", "CHEBSPLAT_WORK"))
+    chosen, cache, work = (
+        os.environ.get(key) for key in ("CHEBSPLAT_CACHE", "XDG_CACHE_HOME", "CHEBSPLAT_WORK")
+    )
     user = Path(cache or Path(os.path.expanduser("~")) / ".cache")
-    defaults = [Path(chosen or user / "chebsplat") / name] + ([Path(work) / ".cache" / name] if work else [])
-    own = os.environ.get("NUMBA_CACHE_DIR")  # numba's word for it; what a user says there is left alone
-    return [folder for folder in ([Path(own)] if own else []) + defaults if own or folder.is_absolute()]
+    defaults = [Path(chosen or user / "chebsplat") / name] + (
+        [Path(work) / ".cache" / name] if work else []
+    )
+    # numba's word for it; what a user says there is left alone
+    own = os.environ.get("NUMBA_CACHE_DIR")
+    return [
+        folder for folder in ([Path(own)] if own else []) + defaults if own or folder.is_absolute()
+    ]
 
 
 def _writable(folder: Path) -> bool:
@@ -62,7 +73,11 @@ def _writable(folder: Path) -> bool:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        log.warning("no kernels can be kept in %s (%s); CHEBSPLAT_CACHE names another folder", folder, error.strerror)
+        log.warning(
+            "no kernels can be kept in %s (%s); CHEBSPLAT_CACHE names another folder",
+            folder,
+            error.strerror,
+        )
         return False
     return True
 
@@ -80,8 +95,9 @@ else:
 
 
 class _ByModule(_CacheLocator):
-    """A kernel's place by its module and source, where numba asks for the file's path and time: another clone of the
-    same source, or one that was moved or checked out again, finds what was compiled.
+    """A kernel's place by its module and source, where numba asks for the file's path and time:
+    another clone of the same source, or one that was moved or checked out again, finds what was
+    compiled.
     """
 
     def __init__(self, module: Path, line: int):
@@ -109,7 +125,9 @@ class _KernelFiles(CompileResultCacheImpl):
 
 
 class _KernelCache(FunctionCache):
-    """A kernel's files on disk. A disk that is full costs the keeping, a damaged file another compilation."""
+    """A kernel's files on disk. A disk that is full costs the keeping, a damaged file another
+    compilation.
+    """
 
     _impl_class = _KernelFiles
 
@@ -117,23 +135,29 @@ class _KernelCache(FunctionCache):
         try:
             return super().load_overload(signature, context)
         except (OSError, EOFError, pickle.UnpicklingError) as error:
-            log.warning("a compiled kernel in %s is damaged (%s) and compiled anew", self.cache_path, error)
+            log.warning(
+                "a compiled kernel in %s is damaged (%s) and compiled anew", self.cache_path, error
+            )
             return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         try:
-            # numba numbers files by an index that it reads first: two processes at once would mix their kernels up.
+            # numba numbers files by an index that it reads first: two processes at once would mix
+            # their kernels up.
             Path(self.cache_path).mkdir(parents=True, exist_ok=True)
             with open(Path(self.cache_path) / ".lock", "w") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 super().save_overload(signature, compiled)
         except OSError as error:
-            log.warning("a kernel cannot be kept in %s (%s): it is compiled again next time; CHEBSPLAT_CACHE names "
+            log.warning("a kernel cannot be kept in %s (%s): it is compiled again next time; "
+                        "CHEBSPLAT_CACHE names "
                         "another folder", self.cache_path, error.strerror)  # fmt: skip
 
 
 class _CompilationLog(event.Listener):
-    """Says what is being compiled, now and then: it takes a minute or two, once for each version of the kernels."""
+    """Says what is being compiled, now and then: it takes a minute or two, once for each version of
+    the kernels.
+    """
 
     def __init__(self) -> None:
         self.kernels, self.depth = 0, 0
@@ -146,8 +170,14 @@ class _CompilationLog(event.Listener):
         self.depth += 1
         function = started.data["dispatcher"].py_func
         if function.__module__.startswith("chebsplat") and now - self.last >= EVERY:
-            done = f"{self.kernels} done in {self.spent(now):.0f} s" if self.kernels else f"kept in {FOLDER}"
-            log.info("compiling kernels: %s of %s (%s)", function.__name__, function.__module__, done)
+            done = (
+                f"{self.kernels} done in {self.spent(now):.0f} s"
+                if self.kernels
+                else (f"kept in {FOLDER}")
+            )
+            log.info(
+                "compiling kernels: %s of %s (%s)", function.__name__, function.__module__, done
+            )
             self.last = now
 
     def on_end(self, ended: event.Event) -> None:
@@ -174,12 +204,16 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
-# No fast-math but contraction: NaN and infinity keep their meaning. Not reassociation either, for kernels just compiled
-# then differ in the last bit from the same ones read from the cache.
-# Threads share what prange says and nothing else: to wake them for np.zeros takes ten times as long as to fill it.
-PRANGE_ALONE = dict.fromkeys(("comprehension", "inplace_binop", "setitem", "numpy", "stencil", "fusion"), False)
+# No fast-math but contraction: NaN and infinity keep their meaning. Not reassociation either, for
+# kernels just compiled then differ in the last bit from the same ones read from the cache.
+# Threads share what prange says and nothing else: to wake them for np.zeros takes ten times as long
+# as to fill it.
+PRANGE_ALONE = dict.fromkeys(
+    ("comprehension", "inplace_binop", "setitem", "numpy", "stencil", "fusion"), False
+)
 kernel: Any = _compiled(parallel=PRANGE_ALONE, fastmath={"contract", "nsz"})
-body: Any = _compiled(fastmath={"contract", "nsz"})  # of a kernel's loop: half the seconds of compiling it in the loop
+# of a kernel's loop: half the seconds of compiling it in the loop
+body: Any = _compiled(fastmath={"contract", "nsz"})
 inline: Any = _compiled(fastmath={"contract", "nsz"}, inline="always")
 lanes: Any = _compiled(fastmath={"contract"})  # of explicit vectors and their scalars
 serial: Any = _compiled()

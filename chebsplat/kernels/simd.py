@@ -1,8 +1,9 @@
 """Vectors of float32, of 16 and less, as values inside numba kernels.
 
-numba's loops vectorise only when LLVM proves that nothing aliases; these say it. LLVM splits a vector wider than the
-machine's registers, so the same source runs on AVX-512 (one register), AVX2 (two), SSE and NEON (four); only a machine
-without fused multiply-add rounds differently. An array argument is contiguous float32, its index counts elements and
+numba's loops vectorise only when LLVM proves that nothing aliases; these say it. LLVM splits a
+vector wider than the machine's registers, so the same source runs on AVX-512 (one register), AVX2
+(two), SSE and NEON (four); only a machine without fused multiply-add rounds differently. An array
+argument is contiguous float32, its index counts elements and
 is not checked: the callers lay out every buffer that they pass.
 """
 
@@ -18,7 +19,8 @@ from numba.core import cgutils, types
 from numba.core.typing.templates import signature
 from numba.extending import models, overload, register_model
 
-intrinsic: Any = extending.intrinsic  # its own type takes the typing context for an argument of the call
+# its own type takes the typing context for an argument of the call
+intrinsic: Any = extending.intrinsic
 FLOAT, INT = ir.FloatType(), ir.IntType(32)
 
 
@@ -66,7 +68,9 @@ def broadcast(builder: Any, scalar: Any, width: int = 16) -> Any:
 def multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
     """a b + c, fused where the machine can."""
     name = f"llvm.fmuladd.v{a.type.count}f32"
-    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(a.type, [a.type] * 3), name)
+    function = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(a.type, [a.type] * 3), name
+    )
     return builder.call(function, [a, b, c])
 
 
@@ -91,7 +95,9 @@ def splat_of(count: int) -> Any:
 
     @intrinsic
     def splat(_typing, scalar):
-        return signature(vector, types.float32), lambda context, builder, sig, args: broadcast(builder, args[0], count)
+        return signature(vector, types.float32), lambda context, builder, sig, args: broadcast(
+            builder, args[0], count
+        )
 
     return splat
 
@@ -103,7 +109,9 @@ def load_of(count: int) -> Any:
     @intrinsic
     def load(_typing, array, index):
         def build(context, builder, sig, args):
-            return builder.load(address(context, builder, sig.args[0], args[0], args[1], plain), align=4)
+            return builder.load(
+                address(context, builder, sig.args[0], args[0], args[1], plain), align=4
+            )
 
         return signature(vector, array, types.intp), build
 
@@ -118,7 +126,9 @@ def store(_typing, array, index, value):
     """array.flat[index : index + count of value] = value."""
 
     def build(context, builder, sig, args):
-        builder.store(args[2], address(context, builder, sig.args[0], args[0], args[1], args[2].type), align=4)
+        builder.store(
+            args[2], address(context, builder, sig.args[0], args[0], args[1], args[2].type), align=4
+        )
         return context.get_dummy_value()
 
     return signature(types.none, array, types.intp, value), build
@@ -143,7 +153,9 @@ def fnma(_typing, a, b, c):
 @intrinsic
 def magnitude(_typing, value):
     """|value|."""
-    return signature(value, value), lambda context, builder, sig, args: _call(builder, "fabs", args[0])
+    return signature(value, value), lambda context, builder, sig, args: _call(
+        builder, "fabs", args[0]
+    )
 
 
 def _binary(name: str) -> Any:
@@ -157,7 +169,9 @@ def _binary(name: str) -> Any:
 def _compare(symbol: str) -> Any:
     @intrinsic
     def apply(_typing, a, b):
-        return signature(a.as_mask(), a, a), lambda context, builder, sig, args: builder.fcmp_ordered(symbol, *args)
+        return signature(
+            a.as_mask(), a, a
+        ), lambda context, builder, sig, args: builder.fcmp_ordered(symbol, *args)
 
     return apply
 
@@ -177,7 +191,12 @@ for _function, _name in (
     (operator.truediv, "fdiv"),
 ):
     _operate(_function, _binary(_name))
-for _function, _symbol in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
+for _function, _symbol in (
+    (operator.lt, "<"),
+    (operator.le, "<="),
+    (operator.gt, ">"),
+    (operator.ge, ">="),
+):
     _operate(_function, _compare(_symbol))
 
 
@@ -199,7 +218,9 @@ def bits(_typing, mask):
 
 @intrinsic
 def scale_by_power(_typing, value, shifted):
-    """value · 2^k, where `shifted` is k + 1.5·2²³, which holds k in its low bits; no over- or underflow."""
+    """value · 2^k, where `shifted` is k + 1.5·2²³, which holds k in its low bits; no over- or
+    underflow.
+    """
 
     def build(context, builder, sig, args):
         whole = ir.VectorType(INT, value.count)
@@ -227,7 +248,9 @@ def spread(_typing, array, index):
     """array.flat[index] in every lane."""
 
     def build(context, builder, sig, args):
-        return broadcast(builder, builder.load(address(context, builder, sig.args[0], args[0], args[1], FLOAT)))
+        return broadcast(
+            builder, builder.load(address(context, builder, sig.args[0], args[0], args[1], FLOAT))
+        )
 
     return signature(F16, array, types.intp), build
 
@@ -243,7 +266,9 @@ def exp2(_typing, x):
         f, value = builder.fsub(x, whole), _constant(_EXP2[-1])
         for coefficient in _EXP2[-2::-1]:
             value = multiply_add(builder, value, f, _constant(coefficient))
-        power = builder.shl(builder.fptosi(whole, whole_numbers), ir.Constant(whole_numbers, [23] * 16))
+        power = builder.shl(
+            builder.fptosi(whole, whole_numbers), ir.Constant(whole_numbers, [23] * 16)
+        )
         return builder.bitcast(builder.add(builder.bitcast(value, whole_numbers), power), WIDE)
 
     return signature(F16, F16), build
@@ -251,7 +276,9 @@ def exp2(_typing, x):
 
 @intrinsic
 def transpose(_typing, array, source, target, stride):
-    """Copy the transpose of the 16×16 block that begins at `source` to the one at `target`; rows are `stride` apart."""
+    """Copy the transpose of the 16×16 block that begins at `source` to the one at `target`; rows
+    are `stride` apart.
+    """
 
     def build(context, builder, sig, args):
         array, source, target, stride = args
@@ -266,7 +293,10 @@ def transpose(_typing, array, source, target, stride):
             for row in range(16):
                 if row & step == 0:
                     pair = rows[row], rows[row + step]
-                    swapped[row], swapped[row + step] = shuffle(builder, *pair, low), shuffle(builder, *pair, high)
+                    swapped[row], swapped[row + step] = (
+                        shuffle(builder, *pair, low),
+                        shuffle(builder, *pair, high),
+                    )
             rows = swapped
         for offset, row in zip(offsets, rows, strict=True):
             to = address(context, builder, sig.args[0], array, builder.add(target, offset), WIDE)

@@ -1,5 +1,6 @@
-"""Meaning: class codes, labels decoded from features, pseudo labels, channels of a teacher, relevancy.
+"""Meaning: class codes, labels decoded from features, pseudo labels, channels of a teacher,
+relevancy.
 
-Features are [..., C] of any length, embeddings [L, C] unit; labels are indices into L names, -1 for none. NumPy
-and SciPy alone; imports nothing of chebsplat.
+Features are [..., C] of any length, embeddings [L, C] unit; labels are indices into L names, -1 for
+none. NumPy and SciPy alone; imports nothing of chebsplat.
 """

@@ -1,4 +1,5 @@
-"""How far views agree on what the same points are: a figure for a 2D teacher that needs no true labels.
+"""How far views agree on what the same points are: a figure for a 2D teacher that needs no true
+labels.
 
 A pixel (u, v) has its centre at half integers; poses are OpenCV's, points in the world.
 """
@@ -19,7 +20,8 @@ BLOCK = 256  # points whose pairs of views are looked at together
 class Agreement(NamedTuple):
     """value: 1 if views always agree, 0 if by chance alone, nan where nothing was said twice.
 
-    share f64 [L]: of what views say; by_label f64 [L]: the label's own agreement, nan where it is never said.
+    share f64 [L]: of what views say; by_label f64 [L]: the label's own agreement, nan where it is
+      never said.
     """
 
     value: float
@@ -27,8 +29,11 @@ class Agreement(NamedTuple):
     by_label: np.ndarray
 
 
-def project(points: np.ndarray, K: np.ndarray, cam_from_world: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Columns u, v in pixels and depth z of points [N, 3] in a view of `size` (width, height): f64 [N, 3].
+def project(
+    points: np.ndarray, K: np.ndarray, cam_from_world: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """Columns u, v in pixels and depth z of points [N, 3] in a view of `size` (width, height): f64
+    [N, 3].
 
     Returns: nan where a point lies outside the view or behind it.
     """
@@ -41,12 +46,15 @@ def project(points: np.ndarray, K: np.ndarray, cam_from_world: np.ndarray, size:
     return np.where(inside[:, None], image, np.nan)
 
 
-def unhidden(image: np.ndarray, size: tuple[int, int], depth: np.ndarray | None = None) -> np.ndarray:
+def unhidden(
+    image: np.ndarray, size: tuple[int, int], depth: np.ndarray | None = None
+) -> np.ndarray:
     """Which projected points [N, 3] no surface hides: bool [N].
 
     Args: depth: [H, W] z-depth of the view, nan where unknown, or None.
-    Choices: without depth the nearest point of a cell of 8 pixels, and of the cells about it, stands for the surface; a
-      floor that is seen from above hides little of itself, and what few points are on hides little behind it.
+    Choices: without depth the nearest point of a cell of 8 pixels, and of the cells about it,
+      stands for the surface; a floor that is seen from above hides little of itself, and what few
+      points are on hides little behind it.
     """
     seen = np.isfinite(image[:, 0])
     columns, rows = (np.where(seen, image[:, k], 0).astype(np.int64) for k in (0, 1))
@@ -57,7 +65,9 @@ def unhidden(image: np.ndarray, size: tuple[int, int], depth: np.ndarray | None 
     nearest = np.full(shape, np.inf)
     np.minimum.at(nearest, (rows[seen] // COARSE + 1, columns[seen] // COARSE + 1), image[seen, 2])
     about = np.lib.stride_tricks.sliding_window_view(nearest, (3, 3)).min((2, 3))
-    return seen & (np.where(seen, image[:, 2], np.inf) < (1 + COARSE_SLACK) * about[rows // COARSE, columns // COARSE])  # type: ignore[no-any-return]
+    limits = (1 + COARSE_SLACK) * about[rows // COARSE, columns // COARSE]
+    visible: np.ndarray = seen & (np.where(seen, image[:, 2], np.inf) < limits)
+    return visible
 
 
 def far_pairs(points: np.ndarray, eyes: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -65,9 +75,9 @@ def far_pairs(points: np.ndarray, eyes: np.ndarray, seen: np.ndarray) -> np.ndar
 
     Args: points [N, 3]; eyes [V, 3] of the views; seen bool [N, V].
     Returns: i64 [M, 3] (point, view, view) of the points that two views see.
-    Choices: the difference of two places is the angle between them at the point, in units of 30°, and the logarithm of
-      the ratio of their distances. Two photos that look alike are taken for the same thing even by a teacher that is
-      wrong; from another side it errs in another way.
+    Choices: the difference of two places is the angle between them at the point, in units of 30°,
+      and the logarithm of the ratio of their distances. Two photos that look alike are taken for
+      the same thing even by a teacher that is wrong; from another side it errs in another way.
     """
     found = [np.zeros((0, 3), np.int64)]
     for start in range(0, len(points), BLOCK):
@@ -86,17 +96,25 @@ def far_pairs(points: np.ndarray, eyes: np.ndarray, seen: np.ndarray) -> np.ndar
 
 
 def between(first: np.ndarray, second: np.ndarray, n_labels: int) -> Agreement:
-    """Agreement of two views on M points: the mean over labels of a chance-corrected intersection over union.
+    """Agreement of two views on M points: the mean over labels of a chance-corrected intersection
+    over union.
 
     Args: first, second: i64 [M], labels in 0...n_labels-1 that the two views of each point say.
-    Choices: a label's IoU of points (both say it / either does) rises with the mIoU that is wanted, of which it is the
-      label-free counterpart, and is as balanced over labels: a teacher that calls everything wall has nothing to
-      disagree on, and one label. Two views that say a label independently, with its share p, have an IoU of
-      p / (2 - p): 0 on the scale of (IoU - chance) / (1 - chance), so that the label that is everywhere counts nothing.
-      Where a single label is said its chance is 1, and its agreement 0. The two views of a point are exchangeable.
+    Choices: a label's IoU of points (both say it / either does) rises with the mIoU that is wanted,
+      of which it is the
+      label-free counterpart, and is as balanced over labels: a teacher that calls everything wall
+        has nothing to
+      disagree on, and one label. Two views that say a label independently, with its share p, have
+      an IoU of
+      p / (2 - p): 0 on the scale of (IoU - chance) / (1 - chance), so that the label that is
+        everywhere counts nothing.
+      Where a single label is said its chance is 1, and its agreement 0. The two views of a point
+      are exchangeable.
     Source: Cohen's correction for chance (1960), of the IoU.
     """
-    counts = np.bincount(first * n_labels + second, minlength=n_labels**2).reshape(n_labels, n_labels)
+    counts = np.bincount(first * n_labels + second, minlength=n_labels**2).reshape(
+        n_labels, n_labels
+    )
     both = 2.0 * np.diag(counts)
     said = (counts.sum(0) + counts.sum(1)).astype(np.float64)
     share = said / max(said.sum(), 1)
@@ -105,4 +123,6 @@ def between(first: np.ndarray, second: np.ndarray, n_labels: int) -> Agreement:
     iou = np.divide(both, 2 * said - both, out=np.zeros(n_labels), where=occurs)
     by_label = np.divide(iou - chance, 1 - chance, out=np.zeros(n_labels), where=chance < 1)
     by_label[~occurs] = np.nan
-    return Agreement(float(by_label[occurs].mean()) if occurs.any() else float("nan"), share, by_label)
+    return Agreement(
+        float(by_label[occurs].mean()) if occurs.any() else float("nan"), share, by_label
+    )

@@ -1,7 +1,9 @@
-"""How likely a place is what a word means, and whether a scene has it at all: relevancy, calibrated.
+"""How likely a place is what a word means, and whether a scene has it at all: relevancy,
+calibrated.
 
-A word is weighed against words that were the nearest of a teacher's vocabulary somewhere in generated rooms, its rivals
-(docs/method.md, section 16). All vectors are of one space; features are made unit, words are taken as they are.
+A word is weighed against words that were the nearest of a teacher's vocabulary somewhere in
+generated rooms, its rivals (docs/method.md, section 16). All vectors are of one space; features are
+made unit, words are taken as they are.
 """
 
 from __future__ import annotations
@@ -12,14 +14,15 @@ from typing import NamedTuple
 import numpy as np
 
 CUT = 0.5  # of probabilities: likelier than not
-STRONGEST = 1000  # one of so many Gaussians, the likeliest ones, tells whether a scene has what was asked for
+# one of so many Gaussians, the likeliest ones, tells whether a scene has what was asked for
+STRONGEST = 1000
 LEAST = 5  # of them, at least
 BLOCK = 4_000_000  # cosines that are held at once
 
 
 class Calibration(NamedTuple):
-    """log-odds of a place: margin * (behind the best rival) + cosine * (with the word) + bias; of presence: the mean
-    log-odds of a scene's likeliest places * strength + offset.
+    """log-odds of a place: margin * (behind the best rival) + cosine * (with the word) + bias; of
+    presence: the mean log-odds of a scene's likeliest places * strength + offset.
     """
 
     margin: float
@@ -37,8 +40,15 @@ def evidence(features: np.ndarray, words: np.ndarray, rivals: np.ndarray) -> np.
     Raises:  ValueError on shapes that do not fit.
     """
     n_channels = features.shape[-1]
-    if words.ndim != 2 or rivals.ndim != 2 or not len(rivals) or {words.shape[1], rivals.shape[1]} != {n_channels}:
-        raise ValueError(f"features {features.shape}, words {words.shape} and rivals {rivals.shape} do not fit")
+    if (
+        words.ndim != 2
+        or rivals.ndim != 2
+        or not len(rivals)
+        or {words.shape[1], rivals.shape[1]} != {n_channels}
+    ):
+        raise ValueError(
+            f"features {features.shape}, words {words.shape} and rivals {rivals.shape} do not fit"
+        )
     rows = features.reshape(-1, n_channels).astype(np.float32)
     found = np.empty((len(rows), len(words), 2), np.float32)
     step = max(BLOCK // (len(rivals) + len(words)), 1)
@@ -52,8 +62,11 @@ def evidence(features: np.ndarray, words: np.ndarray, rivals: np.ndarray) -> np.
     return found.reshape(*features.shape[:-1], len(words), 2)
 
 
-def probability(features: np.ndarray, word: np.ndarray, rivals: np.ndarray, of: Calibration) -> np.ndarray:
-    """How likely each feature [..., C] is what `word` [C] means: f32 [...] in [0, 1]; 0 for a feature of length zero.
+def probability(
+    features: np.ndarray, word: np.ndarray, rivals: np.ndarray, of: Calibration
+) -> np.ndarray:
+    """How likely each feature [..., C] is what `word` [C] means: f32 [...] in [0, 1]; 0 for a
+    feature of length zero.
 
     Raises: ValueError on shapes that do not fit.
     """
@@ -67,21 +80,29 @@ def probable(found: np.ndarray, of: Calibration) -> np.ndarray:
 
 
 def strongest(probabilities: np.ndarray) -> float:
-    """Mean log-odds of a scene's likeliest places: one in STRONGEST, LEAST at least. Raises ValueError without any."""
+    """Mean log-odds of a scene's likeliest places: one in STRONGEST, LEAST at least. Raises
+    ValueError without any.
+    """
     if not probabilities.size:
         raise ValueError("a scene of no places has nothing")
     count = min(max(probabilities.size // STRONGEST, LEAST), probabilities.size)
-    likeliest = np.partition(probabilities.ravel(), -count)[-count:].astype(np.float64).clip(1e-6, 1 - 1e-6)
+    likeliest = (
+        np.partition(probabilities.ravel(), -count)[-count:].astype(np.float64).clip(1e-6, 1 - 1e-6)
+    )
     return float(np.mean(np.log(likeliest / (1 - likeliest))))
 
 
 def presence(probabilities: np.ndarray, of: Calibration) -> float:
-    """How likely a scene, by the probabilities of all its places, has what was asked for; in [0, 1]."""
+    """How likely a scene, by the probabilities of all its places, has what was asked for; in [0,
+    1].
+    """
     return float(_share(np.array(of.strength * strongest(probabilities) + of.offset)))
 
 
 def frequent(features: Sequence[np.ndarray], words: np.ndarray, least: float) -> np.ndarray:
-    """Rows of the words [W, C] that are the nearest of all to more than a share `least` of the features [N, C] each."""
+    """Rows of the words [W, C] that are the nearest of all to more than a share `least` of the
+    features [N, C] each.
+    """
     counts, total = np.zeros(len(words), np.int64), 0
     for rows in features:
         step = max(BLOCK // len(words), 1)
@@ -93,11 +114,13 @@ def frequent(features: Sequence[np.ndarray], words: np.ndarray, least: float) ->
 
 
 def fitted(inputs: np.ndarray, truth: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
-    """Logistic regression: coefficients [D + 1], bias last, of the greatest likelihood of truth bool [N].
+    """Logistic regression: coefficients [D + 1], bias last, of the greatest likelihood of truth
+    bool [N].
 
     Args: inputs [N, D]; weights [N], > 0; default: all alike.
     Raises: ValueError where only one outcome occurs.
-    Choices: Newton's method with a ridge of 1e-6, which keeps separable data finite and moves no other.
+    Choices: Newton's method with a ridge of 1e-6, which keeps separable data finite and moves no
+      other.
     """
     if truth.all() or not truth.any():
         raise ValueError("both outcomes are needed")
@@ -108,9 +131,12 @@ def fitted(inputs: np.ndarray, truth: np.ndarray, weights: np.ndarray | None = N
     for _ in range(50):
         shares = _share(rows @ coefficients)
         gradient = rows.T @ (weights * (shares - truth)) + 1e-6 * coefficients
-        curvature = (rows * (weights * shares * (1 - shares))[:, None]).T @ rows + 1e-6 * np.eye(len(coefficients))
+        curvature = (rows * (weights * shares * (1 - shares))[:, None]).T @ rows + 1e-6 * np.eye(
+            len(coefficients)
+        )
         step = np.linalg.solve(curvature, gradient)
-        step /= max(1.0, float(np.abs(step).max()) / 5)  # a far step would leave where the model is curved
+        # a far step would leave where the model is curved
+        step /= max(1.0, float(np.abs(step).max()) / 5)
         coefficients -= step
         if np.abs(step).max() < 1e-8:
             break
@@ -123,26 +149,40 @@ def _share(odds: np.ndarray) -> np.ndarray:
     return shares
 
 
-def relevancy(features: np.ndarray, query: np.ndarray, against: np.ndarray, temperature: float = 0.1) -> np.ndarray:
-    """Smallest, over the phrases it is weighed against, of the share that the query has of the two (LERF, section 3.3).
+def relevancy(
+    features: np.ndarray, query: np.ndarray, against: np.ndarray, temperature: float = 0.1
+) -> np.ndarray:
+    """Smallest, over the phrases it is weighed against, of the share that the query has of the two
+    (LERF, section 3.3).
 
     Args:
       features:    [..., C] of any length.
-      query:       [C] embedding of what is asked for; against: [K, C] of phrases that fit anything, K >= 1.
+      query:       [C] embedding of what is asked for; against: [K, C] of phrases that fit anything,
+        K >= 1.
       temperature: of the softmax over a pair, > 0.
-    Returns: f32 [...] in [0, 1]; above 0.5 where the query fits better than every one of the phrases.
+    Returns: f32 [...] in [0, 1]; above 0.5 where the query fits better than every one of the
+      phrases.
     Raises:  ValueError on a shape that does not fit, or a temperature that is not positive.
-    Choices: temperature 0.1, that of the labels' confidence, which the paper leaves to its code; features are made
-      unit, embeddings are taken as they are, so that `channels` keeps the teacher's own inner products; a feature of
-      length zero, of a place that no Gaussian covers, is relevant to nothing: 0.
+    Choices: temperature 0.1, that of the labels' confidence, which the paper leaves to its code;
+      features are made unit, embeddings are taken as they are, so that `channels` keeps the
+      teacher's own inner products; a feature of length zero, of a place that no Gaussian covers, is
+      relevant to nothing: 0.
     """
     n_channels = features.shape[-1]
-    if query.shape != (n_channels,) or against.ndim != 2 or against.shape[1] != n_channels or not len(against):
-        raise ValueError(f"features {features.shape}, query {query.shape} and phrases {against.shape} do not fit")
+    if (
+        query.shape != (n_channels,)
+        or against.ndim != 2
+        or against.shape[1] != n_channels
+        or not len(against)
+    ):
+        raise ValueError(
+            f"features {features.shape}, query {query.shape} and phrases {against.shape} do not fit"
+        )
     if not temperature > 0:
         raise ValueError("temperature must be positive")
     lengths = np.linalg.norm(features, axis=-1)
     directions = features / lengths[..., None].clip(1e-6)
-    margin = directions @ query - (directions @ against.T).max(-1)  # the strongest phrase gives the smallest share
+    # the strongest phrase gives the smallest share
+    margin = directions @ query - (directions @ against.T).max(-1)
     shares = 1 / (1 + np.exp(-margin.astype(np.float64) / temperature))
     return np.where(lengths > 0, shares, 0).astype(np.float32)

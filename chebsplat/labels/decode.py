@@ -1,6 +1,8 @@
-"""Labels and features: the label whose embedding has the largest cosine; votes of pseudo labels; codes of class names.
+"""Labels and features: the label whose embedding has the largest cosine; votes of pseudo labels;
+codes of class names.
 
-Class codes are unit vectors of names, one space for all scenes, for teachers without text embeddings.
+Class codes are unit vectors of names, one space for all scenes, for teachers without text
+embeddings.
 """
 
 from __future__ import annotations
@@ -14,11 +16,15 @@ import numpy as np
 TEMPERATURE = 0.1  # of cosines
 BLOCK = 4_000_000  # cosines that are held at once
 IGNORE = -1
-# Names met in indoor datasets; the codes of these repel one another, others are placed where room is left.
+# Names met in indoor datasets; the codes of these repel one another, others are placed where room
+# is left.
 _NAMES = (
-    "wall floor ceiling door window blinds desk table chair sofa cabinet shelf monitor keyboard lamp bin rug plant "
-    "clock picture book cushion bed pillow blanket curtain counter refrigerator television toilet sink bathtub mirror "
-    "shower stool bench box bag bottle vase basket stove oven microwave dishwasher faucet fan radiator stairs pillar "
+    "wall floor ceiling door window blinds desk table chair sofa cabinet shelf monitor keyboard "
+    "lamp bin rug plant "
+    "clock picture book cushion bed pillow blanket curtain counter refrigerator television toilet "
+    "sink bathtub mirror "
+    "shower stool bench box bag bottle vase basket stove oven microwave dishwasher faucet fan "
+    "radiator stairs pillar "
     "tv-screen nightstand armchair wardrobe towel bowl plate cup screen switch vent painting"
 )
 VOCABULARY = tuple(_NAMES.split())
@@ -28,7 +34,8 @@ def decode(features: np.ndarray, embeddings: np.ndarray) -> tuple[np.ndarray, np
     """Label of the largest cosine, and its confidence.
 
     Args: features [..., C] of any length; embeddings [L, C] unit, or what `channels` keeps of them.
-    Returns: labels i16 [...], confidence f32 [...]: softmax of cosines at temperature 0.1, its largest entry.
+    Returns: labels i16 [...], confidence f32 [...]: softmax of cosines at temperature 0.1, its
+      largest entry.
     """
     labels, confidence = (np.zeros(features.shape[:-1], kind) for kind in (np.int16, np.float32))
     for rows, cosines in _cosines(features, embeddings):
@@ -46,8 +53,12 @@ def decode_labels(features: np.ndarray, embeddings: np.ndarray) -> np.ndarray:
     return labels
 
 
-def shares(features: np.ndarray, embeddings: np.ndarray, temperature: float = TEMPERATURE) -> np.ndarray:
-    """How likely each label is, f32 [..., L], rows of sum 1: the softmax that `decode` takes the largest entry of."""
+def shares(
+    features: np.ndarray, embeddings: np.ndarray, temperature: float = TEMPERATURE
+) -> np.ndarray:
+    """How likely each label is, f32 [..., L], rows of sum 1: the softmax that `decode` takes the
+    largest entry of.
+    """
     found = np.zeros((*features.shape[:-1], len(embeddings)), np.float32)
     for rows, cosines in _cosines(features, embeddings):
         weights = np.exp((cosines - cosines.max(-1, keepdims=True)) / temperature)
@@ -56,7 +67,9 @@ def shares(features: np.ndarray, embeddings: np.ndarray, temperature: float = TE
 
 
 def _cosines(features: np.ndarray, embeddings: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
-    """(rows, their cosines [n, L]), BLOCK numbers at a time, so that thousands of labels do not cost gigabytes."""
+    """(rows, their cosines [n, L]), BLOCK numbers at a time, so that thousands of labels do not
+    cost gigabytes.
+    """
     rows = features.reshape(-1, features.shape[-1])
     step = max(BLOCK // len(embeddings), 1)
     for start in range(0, len(rows), step):
@@ -68,13 +81,16 @@ def _cosines(features: np.ndarray, embeddings: np.ndarray) -> Iterator[tuple[sli
 def voted(
     labels: np.ndarray, confidence: np.ndarray, class_codes: np.ndarray, factor: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Features of cells of factor x factor pixels, in which every pixel votes for its label as much as it is sure.
+    """Features of cells of factor x factor pixels, in which every pixel votes for its label as much
+    as it is sure.
 
     Args: labels i16 [H, W], IGNORE none; confidence [H, W] in [0, 1]; class_codes [L, C] unit.
-    Returns: features f32 [h, w, C]: the unit mean of the class codes by votes, zero without a vote; labels i16 [h, w]
-      with the most votes, IGNORE without any; confidence f32 [h, w]: the votes for it by pixel.
-    Choices: a cell at the right or lower edge has fewer pixels. Confidences decide what a cell of several labels is
-      taught, and weigh it in the loss (`training.losses.semantic_loss`); a cell without any is taught nothing.
+    Returns: features f32 [h, w, C]: the unit mean of the class codes by votes, zero without a vote;
+      labels i16 [h, w] with the most votes, IGNORE without any; confidence f32 [h, w]: the votes
+      for it by pixel.
+    Choices: a cell at the right or lower edge has fewer pixels. Confidences decide what a cell of
+      several labels is taught, and weigh it in the loss (`training.losses.semantic_loss`); a cell
+      without any is taught nothing.
     """
     height, width = labels.shape
     h, w = -(-height // factor), -(-width // factor)

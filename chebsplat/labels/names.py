@@ -1,4 +1,6 @@
-"""Names of classes and labels as they are compared: of a source, of a teacher, of knowledge, and of who asks."""
+"""Names of classes and labels as they are compared: of a source, of a teacher, of knowledge, and of
+who asks.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,9 @@ from collections.abc import Iterable
 
 
 def folded(name: str) -> str:
-    """The words of a name: lower case, one blank between them; underscores and hyphens are blanks."""
+    """The words of a name: lower case, one blank between them; underscores and hyphens are
+    blanks.
+    """
     return " ".join(name.lower().replace("_", " ").replace("-", " ").split())
 
 
@@ -16,7 +20,9 @@ def joined(name: str) -> str:
 
 
 def rows_of(names: Iterable[str], known: Iterable[str]) -> list[int]:
-    """Index of each name among those known, the first of equal ones; -1 of a name that is not known."""
+    """Index of each name among those known, the first of equal ones; -1 of a name that is not
+    known.
+    """
     row: dict[str, int] = {}
     for place, name in enumerate(known):
         row.setdefault(joined(name), place)

@@ -1,5 +1,6 @@
-"""Evidence, without true labels, that what a teacher says of photos makes sense: how much of it outlives a
-change of a photo, where in the map such a change is seen, and whether what lies above is called so.
+"""Evidence, without true labels, that what a teacher says of photos makes sense: how much of it
+outlives a change of a photo, where in the map such a change is seen, and whether what lies above is
+called so.
 """
 
 from __future__ import annotations
@@ -9,7 +10,21 @@ from scipy.special import entr, rel_entr, softmax
 
 SHARPNESS = 2.0  # of a softmax of values whose standard deviation is 1
 ABOVE = frozenset(("ceiling", "sky"))
-BELOW = frozenset(("carpet", "earth", "field", "floor", "grass", "ground", "path", "road", "rug", "sand", "sidewalk"))
+BELOW = frozenset(
+    (
+        "carpet",
+        "earth",
+        "field",
+        "floor",
+        "grass",
+        "ground",
+        "path",
+        "road",
+        "rug",
+        "sand",
+        "sidewalk",
+    )
+)
 OUTDOORS = frozenset((
     "boat", "bridge", "building", "bus", "car", "earth", "fence", "field", "grass", "hill", "house", "mountain", "path",
     "river", "road", "rock", "sand", "sea", "sidewalk", "sky", "skyscraper", "snow", "tree", "truck", "water",
@@ -29,10 +44,13 @@ def soft(values: np.ndarray, deviation: float) -> np.ndarray:
 
 
 def information(first: np.ndarray, second: np.ndarray) -> float:
-    """Mutual information, nats, of the labels that shares [V, L, h, w] of the same pixels give: none
-    where one label is said of everything, or where a label depends on how a photo was taken.
+    """Mutual information, nats, of the labels that shares [V, L, h, w] of the same pixels give:
+    none where one label is said of everything, or where a label depends on how a photo was taken.
     """
-    a, b = (np.moveaxis(shares, 1, 0).reshape(shares.shape[1], -1).astype(np.float64) for shares in (first, second))
+    a, b = (
+        np.moveaxis(shares, 1, 0).reshape(shares.shape[1], -1).astype(np.float64)
+        for shares in (first, second)
+    )
     joint = a @ b.T / a.shape[1]
     chance = joint.sum(1, keepdims=True) * joint.sum(0, keepdims=True)
     return float(rel_entr(joint, chance).sum())
@@ -60,7 +78,9 @@ def sense(shares: np.ndarray, names: list[str], indoors: frozenset[str]) -> floa
     """
     words = [frozenset(name.split()) for name in names]
     side = np.array([bool(of & BELOW) - bool(of & ABOVE) for of in words], float)
-    place = np.array([bool(of & indoors and not of & OUTDOORS) - bool(of & OUTDOORS) for of in words], float)
+    place = np.array(
+        [bool(of & indoors and not of & OUTDOORS) - bool(of & OUTDOORS) for of in words], float
+    )
     height = (np.arange(shares.shape[2]) + 0.5) / shares.shape[2] - 0.5
     rows = shares.mean(3)  # [V, L, h]
     lies = 4 * np.einsum("vlh,l,h->v", rows, side, height) / shares.shape[2]

@@ -1,4 +1,6 @@
-"""Kinds of a segmenter's outputs, told by their values, and the probabilities that they stand for."""
+"""Kinds of a segmenter's outputs, told by their values, and the probabilities that they stand
+for.
+"""
 
 from __future__ import annotations
 

@@ -10,8 +10,8 @@ from scipy.spatial import ConvexHull
 
 
 class Volume(NamedTuple):
-    """faces f64 [F, 4]: a point x lies faces[:, :3] @ x + faces[:, 3] outside of each; low, high [3]:
-    corners of the box about it.
+    """faces f64 [F, 4]: a point x lies faces[:, :3] @ x + faces[:, 3] outside of each; low, high
+    [3]: corners of the box about it.
     """
 
     faces: np.ndarray
@@ -25,7 +25,11 @@ def prism(corners: np.ndarray, bottom: float, top: float) -> Volume:
     Raises: ValueError where polygon and heights hold no volume, or a corner lies among the others.
     """
     solid = np.vstack([np.column_stack([corners, np.full(len(corners), z)]) for z in (bottom, top)])
-    if not bottom < top or len(corners) < 3 or np.linalg.matrix_rank(corners - corners[0], 1e-9) < 2:
+    if (
+        not bottom < top
+        or len(corners) < 3
+        or np.linalg.matrix_rank(corners - corners[0], 1e-9) < 2
+    ):
         raise ValueError("holds no volume")
     hull = ConvexHull(solid)
     if len(hull.vertices) < len(solid):
@@ -37,7 +41,8 @@ def holder(points: np.ndarray, volumes: Sequence[Volume], margin: float) -> np.n
     """Which of the volumes holds each point [N, 3]: i32 [N], -1 none.
 
     Args: margin: how far outside of a volume a point may lie, in the points' unit.
-    Choices: of volumes that overlap the first; of those that a point lies just outside of, the nearest.
+    Choices: of volumes that overlap the first; of those that a point lies just outside of, the
+      nearest.
     """
     held, best = np.full(len(points), -1, np.int32), np.full(len(points), np.inf)
     columns = np.ascontiguousarray(points.T)

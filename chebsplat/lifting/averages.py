@@ -1,4 +1,6 @@
-"""What views say of points of a surface: the mean of their unit features over the views that see a point."""
+"""What views say of points of a surface: the mean of their unit features over the views that see a
+point.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,8 @@ from collections.abc import Iterable
 import numpy as np
 
 NEAREST = 0.05  # metres before a camera
-SEEN_WITHIN = (0.03, 0.01)  # metres, and share of the depth: how far a point may lie from what a view sees
+# metres, and share of the depth: how far a point may lie from what a view sees
+SEEN_WITHIN = (0.03, 0.01)
 SWEPT_WITHIN = (0.08, 0.02)  # the same of points of swept depth, which is off by more
 
 
@@ -28,7 +31,8 @@ def averaged(
     Args:
       means:    [N, 3] scene units; unit: scene units in a metre.
       depth:    of each view, [H, W] scene units; nan or 0: unknown, where a view sees nothing.
-      features: of each view, [h, w, n_channels = d]; a row of zeros says nothing. Read view by view.
+      features: of each view, [h, w, n_channels = d]; a row of zeros says nothing. Read view by
+        view.
       Ks:       [V, 3, 3] pixels of the depth; poses [V, 4, 4] camera from world.
       within:   metres, and share of the depth, by which a point may lie off what a view sees.
     """
@@ -43,7 +47,9 @@ def averaged(
         hit = z_of[v[index].astype(int), u[index].astype(int)]
         near = np.abs(hit - z[index]) < within[0] * unit + within[1] * z[index]
         index = index[(hit > 0) & near]
-        seen = said[(v[index] * rows / height).astype(int), (u[index] * columns / width).astype(int)].astype(np.float32)
+        seen = said[
+            (v[index] * rows / height).astype(int), (u[index] * columns / width).astype(int)
+        ].astype(np.float32)
         lengths = np.linalg.norm(seen, axis=1)
         index, seen = index[lengths > 0], seen[lengths > 0] / lengths[lengths > 0, None]
         total[index] += seen

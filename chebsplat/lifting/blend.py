@@ -1,4 +1,6 @@
-"""What the views say of a Gaussian and what is known beforehand, blended by evidence (the start of Eq 10's gate)."""
+"""What the views say of a Gaussian and what is known beforehand, blended by evidence (the start of
+Eq 10's gate).
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,10 @@ from chebsplat.lifting.smoothing import Affinities, smooth
 STRENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # views that knowledge may count for
 ALIKE = 0.2  # correlation of the errors of two views of a thing
 SURE = 3  # power of its length by which knowledge counts
-AGREED = 6  # power by which views count of how far their halves agree, and of how sure they are beside shape
-# What a teacher gets wrong alike in both halves counts as right when they are asked, however many views there are.
+# power by which views count of how far their halves agree, and of how sure they are beside shape
+AGREED = 6
+# What a teacher gets wrong alike in both halves counts as right when they are asked, however many
+# views there are.
 LEAST = 1.0  # strength
 BELIEVED = 0.6, 0.7  # share of labels that shape has alike with a teacher who knows the scene
 LEAST_SHARE = 0.5  # strength, in mean evidence of a Gaussian that is seen
@@ -25,7 +29,8 @@ class Calibration(NamedTuple):
 
     smooth:   features are smoothed before they are blended.
     strength: k, views that knowledge counts for; 0: it is left out.
-    curve:    for off and on, the agreement of the halves, mean cosine, at each strength that was tried.
+    curve:    for off and on, the agreement of the halves, mean cosine, at each strength that was
+      tried.
     """
 
     smooth: bool
@@ -33,10 +38,13 @@ class Calibration(NamedTuple):
     curve: dict[str, dict[float, float]]
 
 
-def blend(features: np.ndarray, evidence: np.ndarray, knowledge: np.ndarray, strength: float) -> np.ndarray:
+def blend(
+    features: np.ndarray, evidence: np.ndarray, knowledge: np.ndarray, strength: float
+) -> np.ndarray:
     """(e f + k' g) / (e + k'), f32 [N, C], with k' of `trusted`; f where that is 0.
 
-    Args: features f [N, C]; evidence e [N] >= 0, see `effective` and `reliable`; knowledge g [N, C]; strength k >= 0.
+    Args: features f [N, C]; evidence e [N] >= 0, see `effective` and `reliable`; knowledge g [N,
+      C]; strength k >= 0.
     """
     e, k = evidence[:, None], trusted(knowledge, strength)[:, None]
     blended = (e * features + k * knowledge) / np.where(e + k > 0, e + k, 1)
@@ -46,27 +54,33 @@ def blend(features: np.ndarray, evidence: np.ndarray, knowledge: np.ndarray, str
 def trusted(knowledge: np.ndarray, strength: float) -> np.ndarray:
     """k' = k |g|^SURE: views that knowledge counts for, f32 [N].
 
-    Choices: an answer is the mean of unit vectors of a teacher over views, so that its length says how alike these
-      were where shapes were like this one; small things, of which shape says least, are left to the views.
+    Choices: an answer is the mean of unit vectors of a teacher over views, so that its length says
+      how alike these were where shapes were like this one; small things, of which shape says least,
+      are left to the views.
     """
     return np.asarray(strength * lengths(knowledge).clip(0, 1) ** SURE, np.float32)
 
 
 def effective(n_views: np.ndarray) -> np.ndarray:
-    """n' = n / (1 + ALIKE (n - 1)): how many views with errors of their own n views are worth, f32 [N].
+    """n' = n / (1 + ALIKE (n - 1)): how many views with errors of their own n views are worth, f32
+    [N].
 
-    Choices: a teacher errs alike in neighbouring views, so that a hundred of them never count for more than five.
+    Choices: a teacher errs alike in neighbouring views, so that a hundred of them never count for
+      more than five.
     """
     n = n_views.astype(np.float32)
     return np.asarray(n / (1 + ALIKE * np.maximum(n - 1, 0)), np.float32)
 
 
 def reliable(halves: np.ndarray, half_views: np.ndarray) -> np.ndarray:
-    """ρ^AGREED, f32 [N]: what views count for where half of them agree with the other half by a cosine of ρ.
+    """ρ^AGREED, f32 [N]: what views count for where half of them agree with the other half by a
+    cosine of ρ.
 
-    Args: halves [2, N, C], features by each half of the views; half_views [2, N] how many of them see each.
-    Choices: the mean ρ where only one half sees a Gaussian, 1 where none is seen by both. Views whose errors are their
-      own agree in their means however wrong each is; a teacher out of its depth says other things from elsewhere.
+    Args: halves [2, N, C], features by each half of the views; half_views [2, N] how many of them
+      see each.
+    Choices: the mean ρ where only one half sees a Gaussian, 1 where none is seen by both. Views
+      whose errors are their own agree in their means however wrong each is; a teacher out of its
+      depth says other things from elsewhere.
     """
     both, agreed = (half_views > 0).all(0), cosines(*halves).clip(0, 1)
     mean = float(agreed[both].mean()) if both.any() else 1.0
@@ -74,15 +88,18 @@ def reliable(halves: np.ndarray, half_views: np.ndarray) -> np.ndarray:
 
 
 def familiar(lifted: np.ndarray, knowledge: np.ndarray, embeddings: np.ndarray) -> float:
-    """σ^AGREED, σ = min(c / c', 1): what a scene's views count for that are sure of labels by c, where shape is by c'.
+    """σ^AGREED, σ = min(c / c', 1): what a scene's views count for that are sure of labels by c,
+    where shape is by c'.
 
-    Args: lifted [N, C], what the views say of Gaussians, zero where none sees one; knowledge [N, C]; embeddings [L, C]
+    Args: lifted [N, C], what the views say of Gaussians, zero where none sees one; knowledge [N,
+      C]; embeddings [L, C]
           of the scene's labels.
     Returns: in (0, 1]; 1 where no view sees a Gaussian.
-    Choices: c and c' are mean confidences of `decode`. Views that agree may agree in what none of them knows: a teacher
-      shown a world that it was not taught is between labels, wherever it looks from. Of a scene, not of a Gaussian:
-      small things have no sure label in either, and are the views' to tell. Gaussians that no view sees are not asked:
-      few photos leave many, which says nothing of the teacher.
+    Choices: c and c' are mean confidences of `decode`. Views that agree may agree in what none of
+      them knows: a teacher shown a world that it was not taught is between labels, wherever it
+        looks from. Of a scene, not of a Gaussian:
+      small things have no sure label in either, and are the views' to tell. Gaussians that no view
+      sees are not asked: few photos leave many, which says nothing of the teacher.
     """
     seen = lifted.any(1)
     if not seen.any():
@@ -92,13 +109,19 @@ def familiar(lifted: np.ndarray, knowledge: np.ndarray, embeddings: np.ndarray) 
 
 
 def believed(
-    lifted: np.ndarray, n_views: np.ndarray, knowledge: np.ndarray, embeddings: np.ndarray, worth: float
+    lifted: np.ndarray,
+    n_views: np.ndarray,
+    knowledge: np.ndarray,
+    embeddings: np.ndarray,
+    worth: float,
 ) -> float:
     """How far shape is believed in a scene, in [0, 1], before its strength is chosen.
 
     Args: as for `familiar`; n_views [N] that see each Gaussian; worth: of `familiar`.
-    Choices: where a teacher knows the scene and many labels of shape, weighed by how sure it is of them, are not
-      its own, it is shape that is wrong: another world than it was taught in. Below BELIEVED it has no say, above it
+    Choices: where a teacher knows the scene and many labels of shape, weighed by how sure it is of
+      them, are not
+      its own, it is shape that is wrong: another world than it was taught in. Below BELIEVED it has
+        no say, above it
       all. A teacher that is unsure of the scene is no judge.
     """
     seen = (n_views >= 2) & lifted.any(1)
@@ -122,30 +145,46 @@ def halves_agree(halves: np.ndarray, half_views: np.ndarray) -> float:
 
 
 def calibrate(
-    halves: np.ndarray, half_views: np.ndarray, near: Affinities, knowledge: np.ndarray | None = None
+    halves: np.ndarray,
+    half_views: np.ndarray,
+    near: Affinities,
+    knowledge: np.ndarray | None = None,
 ) -> Calibration:
-    """Whether to smooth and how far to trust knowledge: what makes half the training views agree with the other half.
+    """Whether to smooth and how far to trust knowledge: what makes half the training views agree
+    with the other half.
 
-    Args: halves [2, N, C], features by each half of the training views; half_views [2, N] how many of them see each;
+    Args: halves [2, N, C], features by each half of the training views; half_views [2, N] how many
+      of them see each;
           near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing is decided.
-    Returns: whether smoothing alone makes the halves agree better, and the strength at which they agree best, of those
-      from LEAST and from LEAST_SHARE of the mean evidence up. Agreement is the cosine between what is made of one half
-      (smoothed, blended by its own views) and the other half's mean features, averaged over the Gaussians that both
-      see, by the other half's views, both ways alike.
-    Choices: no test view is looked at, and no label. On ties, and without a Gaussian that both halves see, what changes
-      less wins. The strength is that for features as they are: what smoothing has made of a half is no longer evidence
+    Returns: whether smoothing alone makes the halves agree better, and the strength at which they
+      agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up. Agreement is the
+      cosine between what is made of one half (smoothed, blended by its own views) and the other
+      half's mean features, averaged over the Gaussians that both see, by the other half's views,
+      both ways alike.
+    Choices: no test view is looked at, and no label. On ties, and without a Gaussian that both
+      halves see, what changes
+      less wins. The strength is that for features as they are: what smoothing has made of a half is
+        no longer evidence
       of its views alone, and asks for less.
     """
-    strengths, reliability = STRENGTHS if knowledge is not None else STRENGTHS[:1], reliable(halves, half_views)
+    strengths, reliability = (
+        STRENGTHS if knowledge is not None else STRENGTHS[:1],
+        reliable(halves, half_views),
+    )
     weights = np.where((half_views > 0).all(0), half_views, 0).astype(np.float64)
     curve: dict[str, dict[float, float]] = {"off": {}, "on": {}}
     for name in curve:
-        made = [smooth(*of, near) if name == "on" else of[0] for of in zip(halves, half_views, strict=True)]
+        made = [
+            smooth(*of, near) if name == "on" else of[0]
+            for of in zip(halves, half_views, strict=True)
+        ]
         for k in strengths:
             agreed = 0.0
             for own, other in ((0, 1), (1, 0)):
                 evidence = effective(half_views[own]) * reliability
-                result = made[own] if knowledge is None else blend(made[own], evidence, knowledge, k)
+                result = (
+                    made[own] if knowledge is None else blend(made[own], evidence, knowledge, k)
+                )
                 agreed += float(weights[other] @ cosines(result, halves[other]))
             curve[name][k] = agreed / max(float(weights.sum()), 1.0)
     evidence, seen = effective(half_views.sum(0)) * reliability, half_views.any(0)
@@ -156,10 +195,11 @@ def calibrate(
 
 
 def start(which: str, lifted: np.ndarray, trained: np.ndarray | None) -> np.ndarray:
-    """What is refined: lifted or trained features [N, C], or, for `both`, their mean direction, as long as the trained.
+    """What is refined: lifted or trained features [N, C], or, for `both`, their mean direction, as
+    long as the trained.
 
-    Choices: training fits features to pictures, single views' errors too; lifting asks all views alike, and knows no
-      picture. They err differently, so that their mean errs less.
+    Choices: training fits features to pictures, single views' errors too; lifting asks all views
+      alike, and knows no picture. They err differently, so that their mean errs less.
     """
     if trained is None or which == "lifted":
         return lifted
@@ -177,10 +217,11 @@ def confidence(
     strength: float = 0.0,
     worth: float = 1.0,
 ) -> np.ndarray:
-    """How long the mean of all votes is beside one for nothing: |n' r f/|f| + k' g/|g|| / (n' + k' + 1), f32 [N].
+    """How long the mean of all votes is beside one for nothing: |n' r f/|f| + k' g/|g|| / (n' + k'
+    + 1), f32 [N].
 
-    Args: agreement r [N] in [0, 1] of the views; worth: of `familiar`, which n' is multiplied by; the others as for
-      `blend`.
+    Args: agreement r [N] in [0, 1] of the views; worth: of `familiar`, which n' is multiplied by;
+      the others as for `blend`.
     """
     n = effective(n_views) * worth
     votes, total = (n * agreement)[:, None] * unit(features), n + 1

@@ -1,6 +1,8 @@
-"""The loops over observations, in numba: rows of Gaussian i are starts[i] to starts[i + 1], in order of views.
+"""The loops over observations, in numba: rows of Gaussian i are starts[i] to starts[i + 1], in
+order of views.
 
-A Gaussian is worked off by one thread, in float64 and in this order: the same bits for any number of threads.
+A Gaussian is worked off by one thread, in float64 and in this order: the same bits for any number
+of threads.
 """
 
 from __future__ import annotations
@@ -50,9 +52,11 @@ def _length(direction):
 
 @serial
 def _average(means, weights, lengths, first, last, chosen, steps, floor, factors, direction, out):
-    """Mean of the chosen rows, after `steps` towards the geometric median of their directions; returns r of the mean.
+    """Mean of the chosen rows, after `steps` towards the geometric median of their directions;
+    returns r of the mean.
 
-    Every step takes a row's weight over its chord to the direction of the last average, or over `floor` if less.
+    Every step takes a row's weight over its chord to the direction of the last average, or over
+    `floor` if less.
     """
     for row in range(first, last):
         factors[row - first] = weights[row]
@@ -86,7 +90,9 @@ def _average(means, weights, lengths, first, last, chosen, steps, floor, factors
 
 @kernel
 def averages(starts, views, weights, means, half_of, steps, floor):
-    """Averages f32 [3, N, C] over all views and by each half of them, `half_of` [V] 0 or 1; agreement r f32 [N]."""
+    """Averages f32 [3, N, C] over all views and by each half of them, `half_of` [V] 0 or 1;
+    agreement r f32 [N].
+    """
     n, channels = len(starts) - 1, means.shape[1]
     features, agreement = np.zeros((3, n, channels), np.float32), np.zeros(n, np.float32)
     for part in prange(PARTS):

@@ -1,7 +1,7 @@
 """What the views say of each Gaussian, and what is made of it without looking at a view again.
 
-A teacher's map of a view becomes a value for each cell of 4×4 pixels; what is known at points goes to Gaussians beside
-them.
+A teacher's map of a view becomes a value for each cell of 4×4 pixels; what is known at points goes
+to Gaussians beside them.
 """
 
 from __future__ import annotations
@@ -17,19 +17,23 @@ from chebsplat.rasterize import CELL
 from chebsplat.rasterize.lift import Lifted
 
 N_BLOCKS = 8  # of views in order, taken in turn by the halves
-NEAREST = 0.1  # a chord of directions, below which a view weighs no more for being nearer to the median
+# a chord of directions, below which a view weighs no more for being nearer to the median
+NEAREST = 0.1
 N_POINTS = 3
 NEAR = 0.01  # metres, within which a point is no nearer than another
-LEAST_COSINE = 0.1  # of the angle between normals, so that a Gaussian of chance orientation still has an answer
+# of the angle between normals, so that a Gaussian of chance orientation still has an answer
+LEAST_COSINE = 0.1
 
 
 @dataclass
 class Observations:
-    """R observations, one of a Gaussian by a view, those of a Gaussian together, in order of views (CSR).
+    """R observations, one of a Gaussian by a view, those of a Gaussian together, in order of views
+    (CSR).
 
     starts:  i64 [N + 1], rows of each Gaussian.
     views:   i32 [R], number of the view among those that were gathered.
-    weights: f32 [R] > 0, pixels: what the Gaussian makes up of the view, counted as its cells count.
+    weights: f32 [R] > 0, pixels: what the Gaussian makes up of the view, counted as its cells
+      count.
     means:   f32 [R, C], the mean of what these cells say.
     """
 
@@ -46,7 +50,8 @@ class Estimate:
     weights:    f32 [N], pixels, over all views.
     n_views:    i32 [N] views that give a Gaussian at least the weight asked for.
     agreement:  f32 [N], r = |Σ w b / |b|| / Σ w: 1 if all views say the same, 0 without a view.
-    halves:     f32 [2, N, C], features by each half of the views alone; half_views i32 [2, N], as n_views.
+    halves:     f32 [2, N, C], features by each half of the views alone; half_views i32 [2, N], as
+      n_views.
     """
 
     features: np.ndarray
@@ -58,7 +63,9 @@ class Estimate:
 
 
 def gathered(n: int, n_channels: int, views: Iterable[Lifted]) -> Observations:
-    """Sort what views say by Gaussian. Choices: float32, about 4 C bytes an observation; nothing is rendered twice."""
+    """Sort what views say by Gaussian. Choices: float32, about 4 C bytes an observation; nothing is
+    rendered twice.
+    """
     lifted = list(views)
     counts = np.zeros(n, np.int64)
     for view in lifted:
@@ -66,40 +73,54 @@ def gathered(n: int, n_channels: int, views: Iterable[Lifted]) -> Observations:
     starts = np.concatenate([[0], counts.cumsum()])
     size, cursors = int(starts[-1]), starts[:-1].copy()
     found = Observations(
-        starts, np.empty(size, np.int32), np.empty(size, np.float32), np.empty((size, n_channels), np.float32)
+        starts,
+        np.empty(size, np.int32),
+        np.empty(size, np.float32),
+        np.empty((size, n_channels), np.float32),
     )
     for number, view in enumerate(lifted):
         kernels.place(*view, number, cursors, found.views, found.weights, found.means)
     return found
 
 
-def estimate(observations: Observations, median_steps: int = 0, min_weight: float = 0.0) -> Estimate:
+def estimate(
+    observations: Observations, median_steps: int = 0, min_weight: float = 0.0
+) -> Estimate:
     """Features of every Gaussian and the evidence for them.
 
     Args:
-      median_steps: of Weiszfeld's, from the weighted mean towards the geometric median of the views' directions
+      median_steps: of Weiszfeld's, from the weighted mean towards the geometric median of the
+        views' directions
                     b / |b|; 0: the mean.
       min_weight:   pixels; a view of less is not counted in n_views.
-    Choices: the result is Σ f b / Σ f with f > 0, so that it never leaves the cone of what views said, as the exact
-      least-squares solution does. Chords below NEAREST count as NEAREST: no single view takes all.
+    Choices: the result is Σ f b / Σ f with f > 0, so that it never leaves the cone of what views
+      said, as the exact least-squares solution does. Chords below NEAREST count as NEAREST: no
+      single view takes all.
     """
     starts, seen = observations.starts, observations.weights >= min_weight
     half_of = halves_of(int(observations.views.max(initial=-1)) + 1)
-    features, agreement = kernels.averages(*vars(observations).values(), half_of, median_steps, NEAREST)
+    features, agreement = kernels.averages(
+        *vars(observations).values(), half_of, median_steps, NEAREST
+    )
     owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     n = len(starts) - 1
     half_views = np.stack(
-        [np.bincount(owner[seen & (half_of[observations.views] == half)], minlength=n) for half in (0, 1)]
+        [
+            np.bincount(owner[seen & (half_of[observations.views] == half)], minlength=n)
+            for half in (0, 1)
+        ]
     ).astype(np.int32)
     weights = np.bincount(owner, observations.weights, minlength=n).astype(np.float32)
-    return Estimate(features[0], weights, half_views.sum(0, dtype=np.int32), agreement, features[1:], half_views)
+    return Estimate(
+        features[0], weights, half_views.sum(0, dtype=np.int32), agreement, features[1:], half_views
+    )
 
 
 def halves_of(n_views: int) -> np.ndarray:
     """Which half each view is of, i8 [V].
 
-    Choices: N_BLOCKS blocks of successive views, by turns: neighbours on a path see alike and err alike, so that halves
-      of every other view would agree on what is wrong.
+    Choices: N_BLOCKS blocks of successive views, by turns: neighbours on a path see alike and err
+      alike, so that halves of every other view would agree on what is wrong.
     """
     return (np.arange(n_views) // max(n_views // N_BLOCKS, 1) % 2).astype(np.int8)
 
@@ -112,11 +133,14 @@ def carry(
     normals: np.ndarray,
     unit: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What is known at points, for Gaussians: the mean of the N_POINTS nearest, by distance and normal.
+    """What is known at points, for Gaussians: the mean of the N_POINTS nearest, by distance and
+    normal.
 
-    Args: values [P, C] at points [P, 3], scene units, with point_normals [P, 3]; means [N, 3] with normals [N, 3]; all
+    Args: values [P, C] at points [P, 3], scene units, with point_normals [P, 3]; means [N, 3] with
+      normals [N, 3]; all
           normals unit, of any sign; unit: scene units of a metre, > 0.
-    Returns: f32 [N, C], and the distance to the nearest point in scene units, f32 [N], for who trusts near points only.
+    Returns: f32 [N, C], and the distance to the nearest point in scene units, f32 [N], for who
+      trusts near points only.
     Raises:  ValueError without points.
     Choices: weights max(|n·n'|, LEAST_COSINE)² / (d² + NEAR²).
     """
@@ -132,11 +156,14 @@ def carry(
 
 
 def overlaps(n_entries: int, n_pixels: int) -> np.ndarray:
-    """Part of each cell that each of n entries, spread evenly over the pixels, covers: [⌈pixels/4⌉, n], rows sum to 1.
+    """Part of each cell that each of n entries, spread evenly over the pixels, covers: [⌈pixels/4⌉,
+    n], rows sum to 1.
 
     A last cell that the image cuts off is its part inside.
     """
-    edges = np.minimum(np.arange(-(-n_pixels // CELL) + 1) * CELL, n_pixels)[:, None].astype(np.float64)
+    edges = np.minimum(np.arange(-(-n_pixels // CELL) + 1) * CELL, n_pixels)[:, None].astype(
+        np.float64
+    )
     marks = np.arange(n_entries + 1) * (n_pixels / n_entries)
     covered = np.minimum(edges[1:], marks[1:]) - np.maximum(edges[:-1], marks[:-1])
     return covered.clip(0) / (edges[1:] - edges[:-1])  # type: ignore[no-any-return]
@@ -148,13 +175,15 @@ def to_cells(
     """What each cell of a view says, and what it counts.
 
     Args:
-      features: [h, w, C] of the teacher; an entry that is zero in all channels, or not finite, says nothing.
+      features: [h, w, C] of the teacher; an entry that is zero in all channels, or not finite, says
+        nothing.
       counts:   [h, w] >= 0, what an entry counts.
-      size:     width and height of the view, pixels; mask [H, W] true where a pixel counts, or None.
+      size:     width and height of the view, pixels; mask [H, W] true where a pixel counts, or
+        None.
     Returns: values f32 [⌈H/4⌉, ⌈W/4⌉, C], counts f32 [⌈H/4⌉, ⌈W/4⌉], 0 where nothing is said.
-    Choices: a cell is the mean of the entries that it lies in, by the area that each covers of it: exact on a grid of
-      cells, an average of a finer one, a copy of a coarser one. A cell counts if all its pixels do, as the reduced
-      pixels that a training looks at.
+    Choices: a cell is the mean of the entries that it lies in, by the area that each covers of it:
+      exact on a grid of cells, an average of a finer one, a copy of a coarser one. A cell counts if
+      all its pixels do, as the reduced pixels that a training looks at.
     """
     said = features.astype(np.float32)
     usable = np.isfinite(said).all(-1) & said.any(-1)

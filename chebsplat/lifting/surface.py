@@ -1,6 +1,8 @@
-"""Points on the surface that views show, for scenes without measured depth: depth of many views, fused.
+"""Points on the surface that views show, for scenes without measured depth: depth of many views,
+fused.
 
-It is rendered from Gaussians, whose own centres lie off the surface that descriptors are of, or swept from photos.
+It is rendered from Gaussians, whose own centres lie off the surface that descriptors are of, or
+swept from photos.
 """
 
 from __future__ import annotations
@@ -21,14 +23,19 @@ OPAQUE = 0.9  # least coverage of a pixel whose depth counts
 NEAREST = 0.05  # metres
 EDGE = 0.06  # metres, of the cubes that one point stands for
 N_PIXELS = 600_000  # that are looked at
-LEAST = 0.4  # of the pixels in the cube of a middling pixel, and three: what floats before a view holds fewer
-EDGE_SWEPT, LEAST_SWEPT = 0.08, 0.2  # the same where photos were swept: coarser, and counted only where views agree
-N_TRIED, N_PLANES, PARALLEL = 400, 20_000, 0.98  # directions, Gaussians that try them; cosine of 11 degrees
+# of the pixels in the cube of a middling pixel, and three: what floats before a view holds fewer
+LEAST = 0.4
+# the same where photos were swept: coarser, and counted only where views agree
+EDGE_SWEPT, LEAST_SWEPT = 0.08, 0.2
+# directions, Gaussians that try them; cosine of 11 degrees
+N_TRIED, N_PLANES, PARALLEL = 400, 20_000, 0.98
 LOOKOUT_SIZE, LOOKOUT_ANGLE = (192, 144), 1.4  # pixels; rad, across
 
 
 class Surface(NamedTuple):
-    """M points: means f64 [M, 3] scene units; eyes f64 [M, 3], the mean of the cameras that saw them."""
+    """M points: means f64 [M, 3] scene units; eyes f64 [M, 3], the mean of the cameras that saw
+    them.
+    """
 
     means: np.ndarray
     eyes: np.ndarray
@@ -44,9 +51,11 @@ def surface(
 ) -> Surface:
     """Points of the surface, at most one in a cube of edge EDGE.
 
-    Args: parameters: raw, of N Gaussians; cam_from_world [V, 4, 4] and Ks [V, 3, 3] of views of `size` (width, height);
+    Args: parameters: raw, of N Gaussians; cam_from_world [V, 4, 4] and Ks [V, 3, 3] of views of
+      `size` (width, height);
           unit: scene units of a metre; n_pixels: that are looked at, of all views alike, drawn.
-    Choices: depth as `render_depth` has it; points averaged by cube. How many pixels a cube needs follows from how many
+    Choices: depth as `render_depth` has it; points averaged by cube. How many pixels a cube needs
+      follows from how many
       others hold: in a wide room, or of few pixels, all hold fewer.
     """
     renderer, (width, height) = SceneRenderer(dict(parameters)), size
@@ -57,29 +66,40 @@ def surface(
         depth, covered = (image.ravel() for image in renderer.render_depth(view, NEAREST * unit))
         pixels = rng.choice(width * height, count, replace=False)
         pixels = pixels[(covered[pixels] > OPAQUE) & np.isfinite(depth[pixels])]
-        rays = np.stack([pixels % width + 0.5, pixels // width + 0.5, np.ones(len(pixels))], 1) @ np.linalg.inv(K).T
+        rays = (
+            np.stack([pixels % width + 0.5, pixels // width + 0.5, np.ones(len(pixels))], 1)
+            @ np.linalg.inv(K).T
+        )
         seen.append((rays * depth[pixels, None] - pose[:3, 3]) @ pose[:3, :3])
         eyes.append(np.tile(-pose[:3, :3].T @ pose[:3, 3], (len(pixels), 1)))
     return fused(np.concatenate(seen), np.concatenate(eyes), EDGE * unit)
 
 
-def swept_surface(depths: np.ndarray, Ks: np.ndarray, cam_from_world: np.ndarray, unit: float = 1.0) -> Surface:
+def swept_surface(
+    depths: np.ndarray, Ks: np.ndarray, cam_from_world: np.ndarray, unit: float = 1.0
+) -> Surface:
     """Points of swept depth [V, h, w], 0: none, at most one in a cube of edge EDGE_SWEPT.
 
     Args: Ks [V, 3, 3] in its pixels; cam_from_world [V, 4, 4]; unit: scene units of a metre.
     """
     seen, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for depth, K, pose, eye in zip(depths, Ks, cam_from_world, centers(cam_from_world), strict=True):
+    for depth, K, pose, eye in zip(
+        depths, Ks, cam_from_world, centers(cam_from_world), strict=True
+    ):
         seen.append(unproject(depth, K, pose, np.argwhere(depth > 0)))
         eyes.append(np.tile(eye, (len(seen[-1]), 1)))
     return fused(np.concatenate(seen), np.concatenate(eyes), EDGE_SWEPT * unit, LEAST_SWEPT)
 
 
-def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Views [V, 4, 4] from within a room, and their K [V, 3, 3], for a splat without cameras; of LOOKOUT_SIZE.
+def lookouts(
+    means: np.ndarray, opacities: np.ndarray, up: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Views [V, 4, 4] from within a room, and their K [V, 3, 3], for a splat without cameras; of
+    LOOKOUT_SIZE.
 
     Args: means [N, 3] scene units, opacities [N] in (0, 1); up [3] unit.
-    Choices: nine places about the middle of what is opaque, at half its height, looking six ways, and up and down.
+    Choices: nine places about the middle of what is opaque, at half its height, looking six ways,
+      and up and down.
     """
     turn = upright(up)
     solid = means[opacities > 0.5] if (opacities > 0.5).any() else means
@@ -91,7 +111,9 @@ def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[
     for x, y in np.ndindex(3, 3):
         eye = low + (high - low) * (0.3 + 0.2 * x, 0.3 + 0.2 * y, 0.5)
         for yaw, pitch in itertools.product(np.arange(6) * np.pi / 3, (0.25, -0.6)):
-            ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+            ahead = np.array(
+                [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)]
+            )
             right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
             rotation = np.stack([right, np.cross(ahead, right), ahead])
             pose = np.eye(4)
@@ -101,16 +123,24 @@ def lookouts(means: np.ndarray, opacities: np.ndarray, up: np.ndarray) -> tuple[
 
 
 def floor_up(means: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Up, unit [3], of Gaussians without cameras: across the planes that hold most of them, away from the fuller end.
+    """Up, unit [3], of Gaussians without cameras: across the planes that hold most of them, away
+    from the fuller end.
 
-    Args: means [N, 3]; normals [N, 3] unit, of any sign; weights [N], how much of a flat surface each stands for.
-    Choices: a floor and what is parallel to it (ceiling, tables) are more than the walls of one direction; things stand
-      on a floor, so that the middle of all lies nearer to it. Directions are tried at the normals of N_TRIED Gaussians.
+    Args: means [N, 3]; normals [N, 3] unit, of any sign; weights [N], how much of a flat surface
+      each stands for.
+    Choices: a floor and what is parallel to it (ceiling, tables) are more than the walls of one
+      direction; things stand on a floor, so that the middle of all lies nearer to it. Directions
+      are tried at the normals of N_TRIED Gaussians.
     """
     rng = np.random.default_rng(0)
     share = weights / weights.sum()
     rows = rng.choice(len(means), N_TRIED, p=share)
-    within = np.abs(normals[rows] @ normals[rng.choice(len(means), min(len(means), N_PLANES), p=share)].T) > PARALLEL
+    within = (
+        np.abs(
+            normals[rows] @ normals[rng.choice(len(means), min(len(means), N_PLANES), p=share)].T
+        )
+        > PARALLEL
+    )
     up: np.ndarray = normals[rows[within.sum(1).argmax()]].astype(np.float64)
     for _ in range(3):  # the mean of what is parallel to it, of either sign
         here = np.abs(normals @ up) > PARALLEL
@@ -121,7 +151,9 @@ def floor_up(means: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.
 
 
 def fused(points: np.ndarray, eyes: np.ndarray, edge: float, least: float = LEAST) -> Surface:
-    """The mean of the points in each cube of this edge, and of their eyes, where it holds enough of them (`least`)."""
+    """The mean of the points in each cube of this edge, and of their eyes, where it holds enough of
+    them (`least`).
+    """
     if len(points) == 0:
         return Surface(points, eyes)
     cube = np.unique(cubes_of(points, edge), return_inverse=True)[1]

@@ -6,10 +6,12 @@ import numpy as np
 
 
 def tell_of(colors: np.ndarray, pixels: np.ndarray) -> bool:
-    """Do colours u8 [N, 3] of points tell more of the pixels u8 [N, 3] that show them than one colour for all would?
+    """Do colours u8 [N, 3] of points tell more of the pixels u8 [N, 3] that show them than one
+    colour for all would?
 
-    Choices: by mean distance, with the pixels' median for the one colour: what is all black, all of one colour, drawn
-      at random or written in other units tells nothing, and needs no list of such cases. Of no points, or of pixels
+    Choices: by mean distance, with the pixels' median for the one colour: what is all black, all of
+      one colour, drawn at random or written in other units tells nothing, and needs no list of such
+      cases. Of no points, or of pixels
       that are all alike, nothing can be told: yes.
     """
     if not len(pixels):

@@ -1,6 +1,8 @@
-"""The exposure and white balance that photos were taken with, measured where several of them show the same points.
+"""The exposure and white balance that photos were taken with, measured where several of them show
+the same points.
 
-Exposures are f64 [V, 3]: stops (logarithms to base 2) of linear light by channel, of the mean view 0.
+Exposures are f64 [V, 3]: stops (logarithms to base 2) of linear light by channel, of the mean view
+  0.
 """
 
 from __future__ import annotations
@@ -14,12 +16,16 @@ from chebsplat.cameras import centers
 CELL = 8  # pixels: colours of a point are means over squares of this side
 MOST_POINTS, LEAST_POINTS = 4000, 30  # points without tracks, and of a view whose exposure is told
 MOST = 300_000  # sightings of points that are looked at, or about as many
-DARK, BRIGHT = 0.005, 0.85  # linear light beyond which a sensor's curve or its end tells instead of the exposure
-ROUNDS, SETTLED = 30, 1e-4  # of medians by point and by view, in turns: more for what drifts along a path, which stays
+# linear light beyond which a sensor's curve or its end tells instead of the exposure
+DARK, BRIGHT = 0.005, 0.85
+# of medians by point and by view, in turns: more for what drifts along a path, which stays
+ROUNDS, SETTLED = 30, 1e-4
 MOST_VIEWS = 1000  # of one process: every second view makes two of 2000
-REACHES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # of `own_part`: how far apart views share, in median distances and radians
+# of `own_part`: how far apart views share, in median distances and radians
+REACHES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 RATIOS = 10.0 ** np.arange(-4, 4.1, 0.25)  # what is a photo's own over what is shared, as variances
-BRIGHTNESS_AND_HUES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])  # orthonormal
+# orthonormal
+BRIGHTNESS_AND_HUES = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])
 
 
 def light_of(values: np.ndarray) -> np.ndarray:
@@ -28,7 +34,9 @@ def light_of(values: np.ndarray) -> np.ndarray:
 
 
 def relit(image: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """An image u8 [H, W, 3] as it would be with so many more stops [3]; what is too bright is cut off."""
+    """An image u8 [H, W, 3] as it would be with so many more stops [3]; what is too bright is cut
+    off.
+    """
     lit = np.minimum(light_of(np.arange(256) / 255)[:, None] * 2.0 ** np.asarray(stops), 1)
     tables = np.where(lit <= 0.0031308, 12.92 * lit, 1.055 * lit ** (1 / 2.4) - 0.055)
     tables = (255 * tables).round().astype(np.uint8)
@@ -44,13 +52,20 @@ def measured_exposures(
 ) -> np.ndarray:
     """Exposures [V, 3] of V photos of the same points; NaN of those that show too few of them.
 
-    Args: images: u8 [H, W, 3] of V views; Ks [V, 3, 3] pixels; cam_from_world [V, 4, 4]; points [N, 3]; tracks: int
+    Args: images: u8 [H, W, 3] of V views; Ks [V, 3, 3] pixels; cam_from_world [V, 4, 4]; points [N,
+      3]; tracks: int
       [T, 2] (point, view), or None: points are seen by all views that have them within their frame.
-    Choices: light is that of a point times its view's exposure. Both are medians, by turns, so that walls in between
-      and highlights count little. Of many points, some: with tracks as many as are seen MOST times in all.
+    Choices: light is that of a point times its view's exposure. Both are medians, by turns, so that
+      walls in between
+      and highlights count little. Of many points, some: with tracks as many as are seen MOST times
+        in all.
     """
     n_views = len(Ks)
-    wanted = min(MOST_POINTS, 4 * MOST // n_views) if tracks is None else len(points) * MOST // max(len(tracks), 1)
+    wanted = (
+        min(MOST_POINTS, 4 * MOST // n_views)
+        if tracks is None
+        else len(points) * MOST // max(len(tracks), 1)
+    )
     kept = np.linspace(0, len(points) - 1, min(len(points), max(wanted, 1))).astype(int)
     if tracks is None:
         seen = [kept] * n_views
@@ -58,7 +73,10 @@ def measured_exposures(
         tracks = tracks[np.isin(tracks[:, 0], kept)]
         tracks = tracks[np.argsort(tracks[:, 1], kind="stable")]
         seen = np.split(tracks[:, 0], np.searchsorted(tracks[:, 1], np.arange(1, n_views)))
-    found = [_light_at(*view) for view in zip(images, Ks, cam_from_world, (points[some] for some in seen), strict=True)]
+    found = [
+        _light_at(*view)
+        for view in zip(images, Ks, cam_from_world, (points[some] for some in seen), strict=True)
+    ]
     light = np.concatenate([values for values, _ in found])
     point = np.concatenate([some[there] for some, (_, there) in zip(seen, found, strict=True)])
     view = np.repeat(np.arange(n_views), [len(values) for values, _ in found])
@@ -69,7 +87,11 @@ def measured_exposures(
     if enough.sum() < 2:
         return exposures
     told = enough[view]
-    light, view, point = np.log2(light[told]), view[told], np.unique(point[told], return_inverse=True)[1]
+    light, view, point = (
+        np.log2(light[told]),
+        view[told],
+        np.unique(point[told], return_inverse=True)[1],
+    )
     of_views = np.zeros((n_views, 3))
     for _ in range(ROUNDS):
         before, of_points = of_views, _medians(light - of_views[view], point)
@@ -81,15 +103,21 @@ def measured_exposures(
     return exposures
 
 
-def _light_at(image: np.ndarray, K: np.ndarray, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean linear light [M, 3] about points [P, 3] in an image, and which of them [P] it tells of."""
+def _light_at(
+    image: np.ndarray, K: np.ndarray, pose: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean linear light [M, 3] about points [P, 3] in an image, and which of them [P] it tells
+    of.
+    """
     height, width = image.shape[:2]
     half = min(CELL, height, width) // 2
     camera = points @ pose[:3, :3].T + pose[:3, 3]
     front = camera[:, 2] > 1e-3
     place = ((camera / np.where(front, camera[:, 2], 1)[:, None]) @ K.T)[:, :2]
     there = front & ((place >= half) & (place <= np.array([width, height]) - half)).all(1)
-    sums = np.pad(light_of(np.arange(256) / 255)[image].cumsum(0).cumsum(1), ((1, 0), (1, 0), (0, 0)))
+    sums = np.pad(
+        light_of(np.arange(256) / 255)[image].cumsum(0).cumsum(1), ((1, 0), (1, 0), (0, 0))
+    )
     x, y = place[there].astype(int).T
     right, left = (sums[y + half, end] - sums[y - half, end] for end in (x + half, x - half))
     means = (right - left) / (2 * half) ** 2
@@ -111,12 +139,14 @@ def _medians(values: np.ndarray, group: np.ndarray, n_groups: int = 0) -> np.nda
 
 
 def own_part(exposures: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
-    """What of exposures [V, 3] is a photo's own, and not shared by the views about it; 0 where they are NaN.
+    """What of exposures [V, 3] is a photo's own, and not shared by the views about it; 0 where they
+    are NaN.
 
-    Choices: what changes smoothly with where a camera stands and looks is left in the photos: views between them, test
-      views too, have it, and a scene can show it. Exposures are a Gaussian process over camera centres, in median
-      distances, and directions (Matérn, 3/2), plus noise that is each photo's own; its reach and the noise's share are
-      those of the largest marginal likelihood, by brightness and by hue.
+    Choices: what changes smoothly with where a camera stands and looks is left in the photos: views
+      between them, test views too, have it, and a scene can show it. Exposures are a Gaussian
+      process over camera centres, in median distances, and directions (Matérn, 3/2), plus noise
+      that is each photo's own; its reach and the noise's share are those of the largest marginal
+      likelihood, by brightness and by hue.
     """
     own = np.zeros_like(exposures)
     known = np.flatnonzero(np.isfinite(exposures).all(1))
@@ -131,7 +161,9 @@ def _own_part(exposures: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
     """`own_part` of exposures that are all known, of not too many views."""
     eye, forward = centers(cam_from_world), cam_from_world[:, 2, :3]
     apart = np.linalg.norm(eye[:, None] - eye, axis=-1)
-    place = np.concatenate([eye / (np.median(apart[apart > 0]) if apart.any() else 1.0), forward], 1)
+    place = np.concatenate(
+        [eye / (np.median(apart[apart > 0]) if apart.any() else 1.0), forward], 1
+    )
     distance = np.sqrt(3) * np.linalg.norm(place[:, None] - place, axis=-1)
     kernels = ((1 + distance / reach) * np.exp(-distance / reach) for reach in REACHES)
     spectra = [tuple(np.linalg.eigh(kernel)) for kernel in kernels]
@@ -140,8 +172,8 @@ def _own_part(exposures: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
 
 
 def _noise_of(values: np.ndarray, spectra: list[tuple[np.ndarray, ...]]) -> np.ndarray:
-    """The noise in values [V] of unknown mean, whose covariance is one of these (eigenvalues, eigenvectors) plus one of
-    RATIOS, times a factor.
+    """The noise in values [V] of unknown mean, whose covariance is one of these (eigenvalues,
+    eigenvectors) plus one of RATIOS, times a factor.
     """
     if np.ptp(values) < 1e-9:
         return np.zeros_like(values)

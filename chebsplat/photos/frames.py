@@ -21,17 +21,22 @@ def shifts(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
     Args: before, after: grey [H, W], H and W at least BLOCK.
     Returns: [B, 2] (x, y) in pixels, whole ones.
-    Choices: a block without a clear peak, such as a plain wall, moves as the median of those with one; 0 of none.
+    Choices: a block without a clear peak, such as a plain wall, moves as the median of those with
+      one; 0 of none.
     """
     window = np.hanning(BLOCK)[:, None] * np.hanning(BLOCK)
 
     def spectra(image: np.ndarray) -> np.ndarray:
-        views = np.lib.stride_tricks.sliding_window_view(image.astype(np.float32), (BLOCK, BLOCK))[::STRIDE, ::STRIDE]
+        views = np.lib.stride_tricks.sliding_window_view(image.astype(np.float32), (BLOCK, BLOCK))[
+            ::STRIDE, ::STRIDE
+        ]
         blocks = views.reshape(-1, BLOCK, BLOCK)
         return np.asarray(np.fft.rfft2((blocks - blocks.mean((1, 2), keepdims=True)) * window))
 
     product = spectra(after) * spectra(before).conj()
-    surface = np.fft.irfft2(product / np.maximum(np.abs(product), 1e-6), (BLOCK, BLOCK)).reshape(-1, BLOCK**2)
+    surface = np.fft.irfft2(product / np.maximum(np.abs(product), 1e-6), (BLOCK, BLOCK)).reshape(
+        -1, BLOCK**2
+    )
     peak = surface.argmax(1)
     moved = np.stack([peak % BLOCK, peak // BLOCK], 1).astype(float)
     moved = np.where(moved >= BLOCK // 2, moved - BLOCK, moved)
@@ -41,11 +46,14 @@ def shifts(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def progress(moves: np.ndarray, step: float = STEP) -> np.ndarray:
-    """How often the picture has moved by `step` up to each frame, [F], in whole and begun steps, never falling.
+    """How often the picture has moved by `step` up to each frame, [F], in whole and begun steps,
+    never falling.
 
-    Args: moves: [F, B, 2] of each block from the frame before, in units of the picture's width; moves[0] is 0.
-    Choices: moves add up with their signs, so that a trembling hand stays where it is; half of the blocks must have
-      moved, so that going forward and turning about the view's axis count, which leave the middle in its place.
+    Args: moves: [F, B, 2] of each block from the frame before, in units of the picture's width;
+      moves[0] is 0.
+    Choices: moves add up with their signs, so that a trembling hand stays where it is; half of the
+      blocks must have moved, so that going forward and turning about the view's axis count, which
+      leave the middle in its place.
     """
     total, reached, begun = np.zeros_like(moves[0]), 0, 0.0
     out = np.zeros(len(moves))
@@ -62,8 +70,8 @@ def choose(steps: np.ndarray, sharpness: np.ndarray, at_most: int) -> np.ndarray
     """The frames to take, ascending: of each step the sharpest of its middle half.
 
     Args: steps: [F] of `progress`; sharpness: [F], higher is sharper.
-    Choices: where there are more steps than `at_most`, several become one; less than half of a step at the end is left
-      out. Of equally sharp frames the first is taken.
+    Choices: where there are more steps than `at_most`, several become one; less than half of a step
+      at the end is left out. Of equally sharp frames the first is taken.
     """
     n_steps = max(int(steps[-1] + 0.5), 1)
     edges = np.linspace(0, n_steps, min(n_steps, at_most) + 1)
@@ -78,7 +86,8 @@ def choose(steps: np.ndarray, sharpness: np.ndarray, at_most: int) -> np.ndarray
 
 
 def laplacian_variance(grey: np.ndarray) -> float:
-    """Variance of the 4-neighbour Laplacian of an image [H, W], inside its borders (Pech-Pacheco et al. 2000).
+    """Variance of the 4-neighbour Laplacian of an image [H, W], inside its borders (Pech-Pacheco et
+    al. 2000).
 
     Returns: 0.0 of an image under 3 pixels a side.
     """
@@ -93,16 +102,19 @@ def laplacian_variance(grey: np.ndarray) -> float:
 def detail(grey: np.ndarray) -> tuple[float, float]:
     """(variance of the Laplacian at full resolution, at a quarter of it) of an image [H, W]."""
     height, width = (side // 4 * 4 for side in grey.shape)
-    coarse = grey[:height, :width].reshape(height // 4, 4, width // 4, 4).mean((1, 3), dtype=np.float32)
+    coarse = (
+        grey[:height, :width].reshape(height // 4, 4, width // 4, 4).mean((1, 3), dtype=np.float32)
+    )
     return laplacian_variance(grey), laplacian_variance(coarse)
 
 
 def blurred(details: np.ndarray) -> np.ndarray:
     """Which views are far less sharp than their capture's median, bool [V], of `detail` [V, 2].
 
-    Choices: two signs must agree. A plain wall has little detail at either scale, and a carpet more at the fine one;
-      blur takes the fine detail and leaves the coarse. Both are ratios to the medians, so that neither the images'
-      size nor their contrast matters, and a capture that is blurred throughout has no blurred view.
+    Choices: two signs must agree. A plain wall has little detail at either scale, and a carpet more
+      at the fine one; blur takes the fine detail and leaves the coarse. Both are ratios to the
+      medians, so that neither the images' size nor their contrast matters, and a capture that is
+      blurred throughout has no blurred view.
     """
     fine, coarse = details.T
     softness = fine / np.maximum(coarse, 1e-9)

@@ -1,4 +1,6 @@
-"""Epipolar lines of known poses: matches looked for along them alone, and how far free matches miss them."""
+"""Epipolar lines of known poses: matches looked for along them alone, and how far free matches miss
+them.
+"""
 
 from __future__ import annotations
 
@@ -9,28 +11,40 @@ import numpy as np
 from chebsplat.kernels.jit import body, kernel, prange
 
 BAND = 1.5  # pixels that a match may miss by, as Sampson measures it
-STRIP = 16.0  # pixels: features are kept by strips of columns, and within a strip by rows of as many
+# pixels: features are kept by strips of columns, and within a strip by rows of as many
+STRIP = 16.0
 RATIO = 0.7  # Lowe's, of the distances of the nearest and the second nearest descriptor by the line
 ALIKE = 0.9  # least cosine of two descriptors
 
 
 def along_lines(
-    pixels: Sequence[np.ndarray], descriptors: Sequence[np.ndarray], pairs: np.ndarray, F: np.ndarray
+    pixels: Sequence[np.ndarray],
+    descriptors: Sequence[np.ndarray],
+    pairs: np.ndarray,
+    F: np.ndarray,
 ) -> list[np.ndarray]:
-    """Matches i64 [M, 2] of each pair: features of its first, in their order, and of its second view.
+    """Matches i64 [M, 2] of each pair: features of its first, in their order, and of its second
+    view.
 
-    Args:    pixels: of each view f32 [n, 2]; descriptors: uint8 [n, D]; pairs i64 [P, 2]; F f64 [P, 3, 3]: of each.
-    Choices: mutual nearest descriptors within BAND, by Lowe's ratio among those that lie there: the line leaves a
-      hundredth of the features, so this is faster than a search of all of them, and finds what repeats elsewhere, too.
-      Chance finds a match among so few more easily: RATIO and ALIKE are stricter than usual, and leave a tenth of such
-      (of fox's matches, with lines moved by 12 pixels across). Where F is 0, as for two views from one place, no
-      feature has a line.
+    Args:    pixels: of each view f32 [n, 2]; descriptors: uint8 [n, D]; pairs i64 [P, 2]; F f64 [P,
+      3, 3]: of each.
+    Choices: mutual nearest descriptors within BAND, by Lowe's ratio among those that lie there: the
+      line leaves a hundredth of the features, so this is faster than a search of all of them, and
+      finds what repeats elsewhere, too.
+      Chance finds a match among so few more easily: RATIO and ALIKE are stricter than usual, and
+        leave a tenth of such
+      (of fox's matches, with lines moved by 12 pixels across). Where F is 0, as for two views from
+      one place, no feature has a line.
     """
     kept = [_by_strips(at) for at in pixels]
     start = np.cumsum([0, *map(len, pixels)])
     partner = _along_lines(
-        np.concatenate([at[order] for at, (order, _, _) in zip(pixels, kept, strict=True)]).astype(np.float32),
-        np.concatenate([some[order] for some, (order, _, _) in zip(descriptors, kept, strict=True)]),
+        np.concatenate([at[order] for at, (order, _, _) in zip(pixels, kept, strict=True)]).astype(
+            np.float32
+        ),
+        np.concatenate(
+            [some[order] for some, (order, _, _) in zip(descriptors, kept, strict=True)]
+        ),
         start,
         np.concatenate([first for _, first, _ in kept]),
         np.cumsum([0, *(len(first) for _, first, _ in kept)]),
@@ -50,7 +64,9 @@ def along_lines(
 
 
 def _by_strips(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """The order of a view's features by cells, the first one of each cell [C + 1], and how many cells a strip has."""
+    """The order of a view's features by cells, the first one of each cell [C + 1], and how many
+    cells a strip has.
+    """
     place = np.floor(np.maximum(pixels, 0) / STRIP).astype(np.int64).reshape(-1, 2)
     strips, rows = place.max(0, initial=0) + 1
     cell = place[:, 0] * rows + place[:, 1]
@@ -78,7 +94,21 @@ def _along_lines(pixels, descriptors, start, first, cells, rows, pairs, F, band,
 
 
 @body
-def _match(pixels, descriptors, length, others, theirs, their_length, first, rows, F, band, ratio, alike, partner):
+def _match(
+    pixels,
+    descriptors,
+    length,
+    others,
+    theirs,
+    their_length,
+    first,
+    rows,
+    F,
+    band,
+    ratio,
+    alike,
+    partner,
+):
     """`partner` [N]: of each feature the other view's that is its match, -1: none."""
     partner[:] = -1
     strips = (len(first) - 1) // rows
@@ -102,7 +132,10 @@ def _match(pixels, descriptors, length, others, theirs, their_length, first, row
             for other in range(first[strip * rows + low], first[strip * rows + high + 1]):
                 p, q = np.float64(others[other, 0]), np.float64(others[other, 1])
                 miss = u * p + v * q + w
-                back_u, back_v = F[0, 0] * p + F[1, 0] * q + F[2, 0], F[0, 1] * p + F[1, 1] * q + F[2, 1]
+                back_u, back_v = (
+                    F[0, 0] * p + F[1, 0] * q + F[2, 0],
+                    F[0, 1] * p + F[1, 1] * q + F[2, 1],
+                )
                 if miss * miss > band * band * (u * u + v * v + back_u * back_u + back_v * back_v):
                     continue
                 cosine = _product(descriptors[k], theirs[other]) / (length[k] * their_length[other])
@@ -127,8 +160,12 @@ def _product(one, other):
     return total
 
 
-def fundamental(K: np.ndarray, pose: np.ndarray, K_other: np.ndarray, pose_other: np.ndarray) -> np.ndarray:
-    """F [3, 3] of two views with intrinsics [3, 3] and cam_from_world [4, 4]: x'ᵀ F x = 0 for pixels of one point."""
+def fundamental(
+    K: np.ndarray, pose: np.ndarray, K_other: np.ndarray, pose_other: np.ndarray
+) -> np.ndarray:
+    """F [3, 3] of two views with intrinsics [3, 3] and cam_from_world [4, 4]: x'ᵀ F x = 0 for
+    pixels of one point.
+    """
     between = pose_other @ np.linalg.inv(pose)
     x, y, z = between[:3, 3]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ between[:3, :3]

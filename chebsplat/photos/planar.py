@@ -1,4 +1,5 @@
-"""Depth of what has no texture: patches of one colour go on as planes through what is known of them.
+"""Depth of what has no texture: patches of one colour go on as planes through what is known of
+them.
 
 Of one photo, reduced. The 1 / z of a plane is linear in its pixels, whatever its slant.
 """
@@ -10,25 +11,31 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-SAME = 0.012  # by which any channel, in [0, 1], of two pixels side by side may differ within a patch
+# by which any channel, in [0, 1], of two pixels side by side may differ within a patch
+SAME = 0.012
 SMALLEST = 40  # pixels of a patch
-KNOWN, SHARE = 12, 0.05  # pixels of known depth, of a patch that is continued, and their share of it
+# pixels of known depth, of a patch that is continued, and their share of it
+KNOWN, SHARE = 12, 0.05
 PLANES, OWN = 3, 0.15  # of a patch at most; share of its known pixels that each must hold
-DRAWS, NEAR = 30, 0.015  # triples that a plane is looked for with; of its depth, within which a pixel lies on it
+# triples that a plane is looked for with; of its depth, within which a pixel lies on it
+DRAWS, NEAR = 30, 0.015
 
 
 def completed(depth: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """Depth f32 [h, w] with what planes add, 0 where nothing is known.
 
     Args:    depth [h, w], 0: none; colors [h, w, 3] in [0, 1].
-    Choices: patches are what neighbouring pixels of nearly one colour connect (SAME): edges of things and of rooms
-      bound them, slow shades do not. A patch has up to PLANES planes, the one with most pixels first (RANSAC with a
-      fixed seed, then least squares); an unknown pixel is of the plane whose own pixels are nearest in the photo.
+    Choices: patches are what neighbouring pixels of nearly one colour connect (SAME): edges of
+      things and of rooms bound them, slow shades do not. A patch has up to PLANES planes, the one
+      with most pixels first (RANSAC with a fixed seed, then least squares); an unknown pixel is of
+      the plane whose own pixels are nearest in the photo.
     """
     result, label = depth.astype(np.float32).copy(), patches(colors)
     known = depth > 0
     sizes, told = np.bincount(label.ravel()), np.bincount(label[known], minlength=label.max() + 1)
-    for patch in np.flatnonzero((sizes >= SMALLEST) & (told >= np.maximum(KNOWN, SHARE * sizes)) & (told < sizes)):
+    for patch in np.flatnonzero(
+        (sizes >= SMALLEST) & (told >= np.maximum(KNOWN, SHARE * sizes)) & (told < sizes)
+    ):
         inside = label == patch
         pixels, missing = np.argwhere(inside & known), np.argwhere(inside & ~known)
         found = planes(pixels, 1 / depth[inside & known])
@@ -37,7 +44,9 @@ def completed(depth: np.ndarray, colors: np.ndarray) -> np.ndarray:
         apart = np.stack([cKDTree(pixels[own]).query(missing)[0] for _, own in found])
         values = np.stack([_design(missing) @ plane for plane, _ in found])
         value = np.take_along_axis(values, apart.argmin(0)[None], 0)[0]
-        result[missing[:, 0], missing[:, 1]] = np.where(value > 0, 1 / np.where(value > 0, value, 1), 0)
+        result[missing[:, 0], missing[:, 1]] = np.where(
+            value > 0, 1 / np.where(value > 0, value, 1), 0
+        )
     return result
 
 
@@ -53,7 +62,8 @@ def patches(colors: np.ndarray) -> np.ndarray:
 
 
 def planes(pixels: np.ndarray, inverse: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Planes of a patch: 1 / z as [3] coefficients of (row, column, 1), and which of its known pixels are on each.
+    """Planes of a patch: 1 / z as [3] coefficients of (row, column, 1), and which of its known
+    pixels are on each.
 
     Args: pixels [P, 2] (row, column) and their 1 / z [P].
     """
@@ -62,7 +72,8 @@ def planes(pixels: np.ndarray, inverse: np.ndarray) -> list[tuple[np.ndarray, np
     design = _design(pixels)
     while len(found) < PLANES and len(left) >= max(KNOWN, OWN * len(pixels)):
         triples = left[rng.integers(0, len(left), (DRAWS, 3))]
-        triples = triples[np.abs(np.linalg.det(design[triples])) > 0.5]  # twice the triangle's pixels
+        # twice the triangle's pixels
+        triples = triples[np.abs(np.linalg.det(design[triples])) > 0.5]
         if not len(triples):
             break
         tried = np.linalg.solve(design[triples], inverse[triples][..., None])[..., 0]

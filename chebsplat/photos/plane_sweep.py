@@ -1,9 +1,10 @@
-"""Depth of posed photos by a plane sweep: how well views agree at each of many depths (Collins 1996; MVSNet's volumes).
+"""Depth of posed photos by a plane sweep: how well views agree at each of many depths (Collins
+1996; MVSNet's volumes).
 
 Which depths of a photo other photos confirm, and which they see through.
 
-Images are grey f32 [V, H, W] in [0, 1], reduced; cameras K [V, 3, 3] in their pixels (centres at half integers) and
-cam_from_world [V, 4, 4]; depth is z in scene units.
+Images are grey f32 [V, H, W] in [0, 1], reduced; cameras K [V, 3, 3] in their pixels (centres at
+half integers) and cam_from_world [V, 4, 4]; depth is z in scene units.
 """
 
 from __future__ import annotations
@@ -15,13 +16,15 @@ from torch import Tensor
 
 from chebsplat.kernels.jit import kernel, prange
 
-WINDOW, SMOOTH = 1, 1  # half widths in pixels: of the patches that are compared, and of the mean over their costs
+# half widths in pixels: of the patches that are compared, and of the mean over their costs
+WINDOW, SMOOTH = 1, 1
 FLAT = 1e-4  # variance that patches are given: two without texture are alike
 BRIGHT = 0.3  # weight of a difference in brightness, as a logarithm, beside 1 - correlation
 OUTSIDE = 4.0  # cost of a pixel that the other view does not see
 AT_ONCE = 8  # depths: what they take stays in a processor's cache
 BEST = 2  # views that must agree, of the neighbours: others may be covered
-SAME, THROUGH = 0.03, 0.05  # of a point's depth: what differs by less confirms it, what lies farther by more denies it
+# of a point's depth: what differs by less confirms it, what lies farther by more denies it
+SAME, THROUGH = 0.03, 0.05
 DENIED = 0.5  # views that may deny a point, for each that confirms it
 
 
@@ -47,14 +50,21 @@ def rays(K: Tensor, height: int, width: int) -> Tensor:
 
 
 def swept_depth(
-    grey: Tensor, valid: Tensor, Ks: Tensor, poses: Tensor, view: int, neighbors: list[int], depths: Tensor
+    grey: Tensor,
+    valid: Tensor,
+    Ks: Tensor,
+    poses: Tensor,
+    view: int,
+    neighbors: list[int],
+    depths: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """The depth [H, W] of a view at which its neighbours look most like it, and its cost [H, W].
 
     Args:    valid f32 [V, H, W]: 1 where a pixel counts; depths [D], evenly spaced in 1 / z.
-    Choices: the cost is one minus the correlation of patches, which no exposure changes, and a little of the difference
-      in brightness, without which flat patches are alike at any depth; of the neighbours the best two count. The
-      lowest point of the parabola through three costs lies between the depths that were tried.
+    Choices: the cost is one minus the correlation of patches, which no exposure changes, and a
+      little of the difference in brightness, without which flat patches are alike at any depth; of
+      the neighbours the best two count. The lowest point of the parabola through three costs lies
+      between the depths that were tried.
     """
     height, width = grey.shape[1:]
     mean, spread = _moments(grey[view])
@@ -64,9 +74,12 @@ def swept_depth(
         ahead = Ks[other] @ between[:3, :3] @ rays(Ks[view], height, width)
         pair = torch.stack([grey[other], valid[other]])[None]
         for some, ranks in zip(depths.split(AT_ONCE), lowest.split(AT_ONCE, 1), strict=True):
-            x, y, z = (ahead * some[:, None, None] + Ks[other] @ between[:3, 3:]).unbind(1)  # each [D, H W]
+            # each [D, H W]
+            x, y, z = (ahead * some[:, None, None] + Ks[other] @ between[:3, 3:]).unbind(1)
             z = torch.where(z > 1e-6, z, torch.nan)
-            place = torch.stack([x / z / width * 2 - 1, y / z / height * 2 - 1], -1).nan_to_num(nan=-9.0)
+            place = torch.stack([x / z / width * 2 - 1, y / z / height * 2 - 1], -1).nan_to_num(
+                nan=-9.0
+            )
             seen = F.grid_sample(
                 pair.expand(len(some), -1, -1, -1),
                 place.reshape(len(some), height, width, 2),
@@ -96,18 +109,25 @@ def _moments(values: Tensor) -> tuple[Tensor, Tensor]:
     return mean, (box_mean(values.square(), WINDOW) - mean.square()).clamp_min(0).sqrt()
 
 
-def agreed(depth: np.ndarray, Ks: np.ndarray, poses: np.ndarray, others: np.ndarray, least: int) -> np.ndarray:
-    """Depth f32 [V, h, w] that others agree on: the mean of what they and the view itself have; 0 elsewhere.
+def agreed(
+    depth: np.ndarray, Ks: np.ndarray, poses: np.ndarray, others: np.ndarray, least: int
+) -> np.ndarray:
+    """Depth f32 [V, h, w] that others agree on: the mean of what they and the view itself have; 0
+    elsewhere.
 
-    Args: depth [V, h, w], 0 where none is known; Ks [V, 3, 3] in its pixels; cam_from_world [V, 4, 4];
-          others i64 [V, M]: the views that each is compared with, -1: none; least: of them that must confirm a pixel.
-    Choices: a view denies a point where it sees farther than that: nothing can be there. What a view sees before a
-      point hides it, and says nothing.
+    Args: depth [V, h, w], 0 where none is known; Ks [V, 3, 3] in its pixels; cam_from_world [V, 4,
+      4];
+          others i64 [V, M]: the views that each is compared with, -1: none; least: of them that
+            must confirm a pixel.
+    Choices: a view denies a point where it sees farther than that: nothing can be there. What a
+      view sees before a point hides it, and says nothing.
     """
     rotations, eyes = poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3:]
     to_world = np.concatenate([rotations @ np.linalg.inv(Ks), -rotations @ eyes], 2)
     into = Ks @ poses[:, :3]
-    return np.asarray(_agreed(np.ascontiguousarray(depth, np.float32), to_world, into, others, least))
+    return np.asarray(
+        _agreed(np.ascontiguousarray(depth, np.float32), to_world, into, others, least)
+    )
 
 
 @kernel

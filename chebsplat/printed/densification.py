@@ -44,7 +44,9 @@ def ball_volume(radius: float) -> float:
     return 4 / 3 * math.pi * radius**3
 
 
-def accepted(candidates: Tensor, points: Tensor, nearest: float, farthest: float) -> tuple[Tensor, Tensor]:
+def accepted(
+    candidates: Tensor, points: Tensor, nearest: float, farthest: float
+) -> tuple[Tensor, Tensor]:
     """Mask [A] of the candidates [A, 3] to keep, and the points i64 [A] that they inherit from.
 
     Kept are those whose nearest point [N, 3] lies between `nearest` and `farthest` away.

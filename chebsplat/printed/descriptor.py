@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 ROUNDING = 1e-12  # of an eigenvalue: below, it is zero
-CONDITION = 1e-8  # of degrees, the least over the largest, down to which D^-1/2 loses no figures that count
+# of degrees, the least over the largest, down to which D^-1/2 loses no figures that count
+CONDITION = 1e-8
 
 
 def metric(covariances: Tensor, beta: float) -> Tensor:
@@ -51,17 +52,23 @@ def laplacian(weights: Tensor, present: Tensor) -> Tensor:
 def eigenpairs(weights: Tensor, present: Tensor, n_eigs: int) -> tuple[Tensor, Tensor]:
     """The K smallest eigenvalues [..., K] of L and its right eigenvectors [..., n, K], |phi_k| = 1.
 
-    L is not symmetric; with v of the symmetric D^1/2 L D^-1/2, phi = D^-1/2 v has the same eigenvalue.
-    Where degrees a_i lie too far apart for that, L itself is decomposed, at ten times the cost.
-    Choices: the print does not say which K (the smoothest), nor which vectors span an eigenvalue that
-      is there twice (those that LAPACK returns). A region of fewer than K members has zeros beyond.
+    L is not symmetric; with v of the symmetric D^1/2 L D^-1/2, phi = D^-1/2 v has the same
+    eigenvalue. Where degrees a_i lie too far apart for that, L itself is decomposed, at ten times
+    the cost.
+    Choices: the print does not say which K (the smoothest), nor which vectors span an eigenvalue
+      that is there twice (those that LAPACK returns). A region of fewer than K members has zeros
+      beyond.
     """
     n, dtype, shape = weights.shape[-1], weights.dtype, weights.shape[:-2]
-    weights, present = weights.reshape(shape.numel(), n, n).double(), present.reshape(shape.numel(), n)
+    weights, present = (
+        weights.reshape(shape.numel(), n, n).double(),
+        present.reshape(shape.numel(), n),
+    )
     degree = weights.sum(-1)
     attached = degree > 0
     root = torch.where(attached, degree, 1.0).rsqrt()
-    beyond = torch.diag_embed(torch.where(present, 1.0, 10.0).to(weights))  # absent members come last
+    # absent members come last
+    beyond = torch.diag_embed(torch.where(present, 1.0, 10.0).to(weights))
     values, vectors = symmetric_eigh(beyond - root[..., :, None] * weights * root[..., None, :])
     vectors = root[..., None] * vectors
     least = degree.masked_fill(~attached, torch.inf).amin(-1)
@@ -124,7 +131,9 @@ def descriptor(
 
 
 def symmetric_eigh(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """`torch.linalg.eigh` by NumPy: torch wakes all threads for each small matrix, and waits where others compute."""
+    """`torch.linalg.eigh` by NumPy: torch wakes all threads for each small matrix, and waits where
+    others compute.
+    """
     values, vectors = np.linalg.eigh(matrices.numpy())
     return torch.from_numpy(values), torch.from_numpy(vectors)
 

@@ -55,7 +55,9 @@ def spread(descriptors: Tensor, present: Tensor) -> Tensor:
     return (away.square().sum((-1, -2)) / count).sqrt()
 
 
-def update(W: Tensor, B: Tensor | None, sigma_f: float, *, kappa: float, epsilon: float, eta: float) -> Tensor:
+def update(
+    W: Tensor, B: Tensor | None, sigma_f: float, *, kappa: float, epsilon: float, eta: float
+) -> Tensor:
     """B <- orth([B, U]) with the top left singular vectors U of R that hold eta of its energy.
 
     Only if rho' = rho (1 + kappa sigma_f) exceeds epsilon. No basis yet: R = W. As printed, nothing

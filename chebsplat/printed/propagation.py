@@ -1,4 +1,6 @@
-"""From regions back to points (Eqs 8-9). A pair is a point i64 [E] and a region i64 [E] that holds it."""
+"""From regions back to points (Eqs 8-9). A pair is a point i64 [E] and a region i64 [E] that holds
+it.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ def weights(
     return shares
 
 
-def propagate(encodings: Tensor, shares: Tensor, pairs: tuple[Tensor, Tensor], n_points: int) -> Tensor:
+def propagate(
+    encodings: Tensor, shares: Tensor, pairs: tuple[Tensor, Tensor], n_points: int
+) -> Tensor:
     """f_shape [P, C] of points from encodings [M, C] and `weights` [E] (Eq 9); 0 in no region."""
     point, region = pairs
     shape = encodings.new_zeros(n_points, encodings.shape[1])

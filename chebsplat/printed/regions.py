@@ -20,7 +20,8 @@ class Regions(NamedTuple):
     """Regions of points [P, 3].
 
     centers i64 [M]: the points at their centres. pairs: (point i64 [E], region i64 [E]), one for
-    each point in a ball. members i64 [M, n], -1 where padded: those that the region is encoded from,
+    each point in a ball. members i64 [M, n], -1 where padded: those that the region is encoded
+      from,
     its centre first. radius: scene units.
     """
 
@@ -44,9 +45,9 @@ class Regions(NamedTuple):
 def regions_of(points: Tensor, count: int, size: int, generator: torch.Generator) -> Regions:
     """Regions N(c) = {p : |p - c| <= r} of points [P, 3] about `count` farthest points.
 
-    Choices: r is OVERLAP times the covering radius of the centres, so that every point lies in a ball.
-      A ball may hold thousands of points; its shape is encoded from its centre and `size` - 1 others
-      drawn at random, anew at each call, and all its points receive the encoding.
+    Choices: r is OVERLAP times the covering radius of the centres, so that every point lies in a
+      ball. A ball may hold thousands of points; its shape is encoded from its centre and `size` - 1
+      others drawn at random, anew at each call, and all its points receive the encoding.
     """
     places = points.detach().double().numpy()
     n_points = len(places)
@@ -80,7 +81,9 @@ def _farthest_points(places: np.ndarray, count: int, start: int) -> np.ndarray:
     return distinct
 
 
-def _drawn_members(centers: Tensor, point: Tensor, region: Tensor, size: int, generator: torch.Generator) -> Tensor:
+def _drawn_members(
+    centers: Tensor, point: Tensor, region: Tensor, size: int, generator: torch.Generator
+) -> Tensor:
     """members i64 [M, size]: of each ball its centre, then others in random order, -1 beyond."""
     order = torch.rand(len(point), generator=generator)
     order[point == centers[region]] = -1.0

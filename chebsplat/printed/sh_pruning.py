@@ -9,7 +9,9 @@ DEGREES = (0, 1, 2, 3)
 STARTS_AT = 1.0  # logit of every mask: open
 
 
-def soft_histogram(values: Tensor, present: Tensor, low: Tensor, high: Tensor, n_bins: int, softness: float) -> Tensor:
+def soft_histogram(
+    values: Tensor, present: Tensor, low: Tensor, high: Tensor, n_bins: int, softness: float
+) -> Tensor:
     """H[b] = sum_x s(gamma (x - left_b)) - s(gamma (x - right_b)), [..., n_bins] (Eq 13).
 
     Args: values [..., n], those not `present` count nothing; low, high [...]: m and M of [m, M].
@@ -26,8 +28,8 @@ def region_histograms(bands: list[Tensor], members: Tensor, n_bins: int, softnes
     """H of degrees 0 to 3 in regions of members i64 [M, n], -1 where padded: [M, 4, n_bins].
 
     Args: bands: SH coefficients [N, 2 l + 1, 3] of each degree.
-    Choices: the print does not say what a degree's colour values are: its coefficients, which belong to
-      no view, so that a mask is one of the scene. [m, M] is what occurs in the region.
+    Choices: the print does not say what a degree's colour values are: its coefficients, which
+      belong to no view, so that a mask is one of the scene. [m, M] is what occurs in the region.
     """
     present, rows = members >= 0, members.clamp_min(0)
     histograms = []
@@ -52,7 +54,8 @@ class BandMasks(nn.Module):
         super().__init__()
         self.n_bins = n_bins
         self.embed = nn.ModuleList(
-            nn.Sequential(nn.Linear(n_bins, width), nn.ReLU(), nn.Linear(width, width)) for _ in DEGREES
+            nn.Sequential(nn.Linear(n_bins, width), nn.ReLU(), nn.Linear(width, width))
+            for _ in DEGREES
         )
         maps = [nn.Linear(n_channels + 1 + width, 1) for _ in DEGREES]
         with torch.no_grad():
@@ -62,7 +65,9 @@ class BandMasks(nn.Module):
                 linear.bias.fill_(STARTS_AT)
         self.output = nn.ModuleList(maps)
 
-    def forward(self, features: Tensor, logits: Tensor, histograms: Tensor, region: Tensor) -> Tensor:
+    def forward(
+        self, features: Tensor, logits: Tensor, histograms: Tensor, region: Tensor
+    ) -> Tensor:
         """f [N, C], psi [N, 4], histograms [M, 4, B], region i64 [N] or -1 -> delta [N, 4]."""
         columns = []
         for degree in DEGREES:

@@ -1,7 +1,8 @@
 """Differentiable Gaussian rasterization behind one signature, in the words of gsplat.
 
-Means and scales are in scene units, cameras are OpenCV's (x right, y down, z forward) as viewmats [C, 4, 4] from the
-world, pixel (0, 0) has its centre at (0.5, 0.5), colours have any number of channels. May import kernels, splats.
+Means and scales are in scene units, cameras are OpenCV's (x right, y down, z forward) as viewmats
+[C, 4, 4] from the world, pixel (0, 0) has its centre at (0.5, 0.5), colours have any number of
+channels. May import kernels, splats.
 """
 
 from __future__ import annotations
@@ -19,15 +20,17 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render Gaussians; arguments and results as `reference.rasterize`.
 
-    Args: backend: `cpu` (float32, numba), `reference` (plain torch, any float type), `cuda` (gsplat), or `auto`:
-      cuda for tensors on a GPU, cpu for float32 on the CPU, otherwise the reference.
+    Args: backend: `cpu` (float32, numba), `reference` (plain torch, any float type), `cuda`
+      (gsplat), or `auto`: cuda for tensors on a GPU, cpu for float32 on the CPU, otherwise the
+        reference.
     Raises: ValueError on an unknown backend, or tensors that the chosen one does not take.
     """
     if backend == "auto":
         on_cpu = "cpu" if means.dtype == torch.float32 else "reference"
         backend = {"cuda": "cuda", "cpu": on_cpu}.get(means.device.type, "reference")
     chosen: Any
-    if backend == "cpu":  # spelt out, not looked up by name: a stage's identity is the code that it imports
+    # spelt out, not looked up by name: a stage's identity is the code that it imports
+    if backend == "cpu":
         from chebsplat.rasterize import cpu as chosen
     elif backend == "cuda":
         from chebsplat.rasterize import cuda as chosen

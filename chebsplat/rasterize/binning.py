@@ -1,8 +1,10 @@
 """Which Gaussians touch which tiles, front to back.
 
-A Gaussian touches a tile through one *pair*. Pairs are numbered by band of tile rows, then Gaussian by Gaussian: the
-gradient records that a Gaussian collects in a band lie together and are summed in a fixed order. No atomics, the same
-bits for any number of threads, and records for one band at a time. Work is dealt out in PARTS, whatever the threads.
+A Gaussian touches a tile through one *pair*. Pairs are numbered by band of tile rows, then Gaussian
+by Gaussian: the gradient records that a Gaussian collects in a band lie together and are summed in
+  a fixed order. No atomics, the same
+bits for any number of threads, and records for one band at a time. Work is dealt out in PARTS,
+whatever the threads.
 """
 
 from __future__ import annotations
@@ -22,9 +24,9 @@ DIGIT = 11  # bits of a sorting pass: three passes for 32
 
 
 class Bins(NamedTuple):
-    """order i32 [V]: the Gaussians that touch a tile, front to back; their position in it is their *rank*.
-    tile_starts i64 [tiles + 1] and, in tile order and front to back within, rank and pair, i32 [P];
-    pair_starts i32 [bands, V + 1] by rank.
+    """order i32 [V]: the Gaussians that touch a tile, front to back; their position in it is their
+    *rank*. tile_starts i64 [tiles + 1] and, in tile order and front to back within, rank and pair,
+    i32 [P]; pair_starts i32 [bands, V + 1] by rank.
     """
 
     order: np.ndarray
@@ -52,8 +54,14 @@ def _box(means2d, covariances, opacities, i, width, height, boxes):
     limit = 2.0 * math.log(255.0 * opacities[i]) + 1e-3  # the cells' own test is exact
     reach_x, reach_y = math.sqrt(limit * covariances[i, 0]), math.sqrt(limit * covariances[i, 2])
     # a pixel's centre is at +0.5
-    x0, x1 = max(means2d[i, 0] - reach_x - 0.5, 0.0), min(means2d[i, 0] + reach_x + 0.5, float(width))
-    y0, y1 = max(means2d[i, 1] - reach_y - 0.5, 0.0), min(means2d[i, 1] + reach_y + 0.5, float(height))
+    x0, x1 = (
+        max(means2d[i, 0] - reach_x - 0.5, 0.0),
+        min(means2d[i, 0] + reach_x + 0.5, float(width)),
+    )
+    y0, y1 = (
+        max(means2d[i, 1] - reach_y - 0.5, 0.0),
+        min(means2d[i, 1] + reach_y + 0.5, float(height)),
+    )
     if x0 < x1 and y0 < y1:
         boxes[i, 0], boxes[i, 1] = int(x0) // TILE, (math.ceil(x1) + TILE - 1) // TILE
         boxes[i, 2], boxes[i, 3] = int(y0) // TILE, (math.ceil(y1) + TILE - 1) // TILE
@@ -67,12 +75,19 @@ def _usable(radii, opacities, colors, cell_colors, i):
         check += colors[i, d] * np.float32(0)
     for d in range(cell_colors.shape[1]):
         check += cell_colors[i, d] * np.float32(0)
-    return radii[i] != 0 and opacities[i] >= np.float32(ALPHA_MIN) and math.isfinite(opacities[i]) and check == 0
+    return (
+        radii[i] != 0
+        and opacities[i] >= np.float32(ALPHA_MIN)
+        and math.isfinite(opacities[i])
+        and check == 0
+    )
 
 
 @serial
 def _sort(index, keys):
-    """`index` by ascending key, ties as they come: a radix sort, faster on one thread than dealt out to several."""
+    """`index` by ascending key, ties as they come: a radix sort, faster on one thread than dealt
+    out to several.
+    """
     n, size = len(index), 1 << DIGIT
     other_index, other_keys = np.empty_like(index), np.empty_like(keys)
     mask = np.uint32(size - 1)
@@ -104,8 +119,14 @@ def _boxes(means2d, covariances, radii, opacities, colors, cell_colors, width, h
 
 @serial
 def _shown(boxes, depths):
-    """Indices of the Gaussians that touch a tile, and their depths as keys that sort alike: depths are positive."""
-    index, keys, bits = np.empty(len(boxes), np.int32), np.empty(len(boxes), np.uint32), depths.view(np.uint32)
+    """Indices of the Gaussians that touch a tile, and their depths as keys that sort alike: depths
+    are positive.
+    """
+    index, keys, bits = (
+        np.empty(len(boxes), np.int32),
+        np.empty(len(boxes), np.uint32),
+        depths.view(np.uint32),
+    )
     n = 0
     for i in range(len(boxes)):
         index[n], keys[n] = i, bits[i]
@@ -123,7 +144,12 @@ def _deal(order, boxes, columns, rows):
         band_of[y] = ((y + 1) * bands - 1) // rows  # the last that starts here or before
     for part in prange(PARTS):
         for m in range(_share(part, n), _share(part + 1, n)):
-            x0, x1, y0, y1 = boxes[order[m], 0], boxes[order[m], 1], boxes[order[m], 2], boxes[order[m], 3]
+            x0, x1, y0, y1 = (
+                boxes[order[m], 0],
+                boxes[order[m], 1],
+                boxes[order[m], 2],
+                boxes[order[m], 3],
+            )
             for y in range(y0, y1):
                 pair_starts[band_of[y], m + 1] += x1 - x0
                 for x in range(x0, x1):
@@ -144,7 +170,12 @@ def _deal(order, boxes, columns, rows):
     rank, pair = np.empty(total, np.int32), np.empty(total, np.int32)
     for part in prange(PARTS):
         for m in range(_share(part, n), _share(part + 1, n)):
-            x0, x1, y0, y1 = boxes[order[m], 0], boxes[order[m], 1], boxes[order[m], 2], boxes[order[m], 3]
+            x0, x1, y0, y1 = (
+                boxes[order[m], 0],
+                boxes[order[m], 1],
+                boxes[order[m], 2],
+                boxes[order[m], 3],
+            )
             band, k = -1, 0
             for y in range(y0, y1):
                 if band_of[y] != band:
@@ -165,9 +196,11 @@ def bin_gaussians(
     """Pairs of Gaussians and tiles of one view.
 
     Args: as `ellipses.project` gives them; opacities [N]; colors [N, D], cell_colors [N, E].
-    Choices: the box of the ellipse α ≥ 1/255; a Gaussian that is fainter, or not finite in opacity or in any
-      channel, touches nothing. Ties in depth go by index.
+    Choices: the box of the ellipse α ≥ 1/255; a Gaussian that is fainter, or not finite in opacity
+      or in any channel, touches nothing. Ties in depth go by index.
     """
     boxes = _boxes(means2d, covariances, radii, opacities, colors, cell_colors, width, height)
     order = _sort(*_shown(boxes, depths))
-    return Bins(order, *_deal(order, boxes, (width + TILE - 1) // TILE, (height + TILE - 1) // TILE))
+    return Bins(
+        order, *_deal(order, boxes, (width + TILE - 1) // TILE, (height + TILE - 1) // TILE)
+    )

@@ -1,7 +1,8 @@
-"""The adjoint of compositing inside one cell (see `cells`): from gradients of pixels to records of Gaussians.
+"""The adjoint of compositing inside one cell (see `cells`): from gradients of pixels to records of
+Gaussians.
 
-With g = dL/d(log₂ α), a record holds Σg, Σgu, Σgv, Σgu², Σguv, Σgv², Σ|g_x|, Σ|g_y| over the pixels of a tile, then the
-gradients to the channels, in fours, and to the cell channels, in whole vectors.
+With g = dL/d(log₂ α), a record holds Σg, Σgu, Σgv, Σgu², Σguv, Σgv², Σ|g_x|, Σ|g_y| over the pixels
+of a tile, then the gradients to the channels, in fours, and to the cell channels, in whole vectors.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ from chebsplat.rasterize.cells import (
 
 @lanes
 def slopes(shapes, rows, grads, count, cell, depth, out):
-    """out[m] = dL/d(weight m) by lane: the image's gradients [cells, depth, 16] times the channels of rows[m]."""
+    """out[m] = dL/d(weight m) by lane: the image's gradients [cells, depth, 16] times the channels
+    of rows[m].
+    """
     at, step = LANES * cell * grads.shape[1], shapes.shape[1]
     for m in range(0, count, BLOCK):
         multiply(out, LANES * m, IN_ORDER, 0, LANES, shapes, SHAPE, step, 1, rows, m, 1, grads, at, LANES, depth,
@@ -42,8 +45,8 @@ def slopes(shapes, rows, grads, count, cell, depth, out):
 def unwind(alphas, weights, out, count, max_alpha):
     """Turn dL/d(weight) into g = dL/d(log₂ α), in place, back to front.
 
-    With B the slope of all that lies behind, as seen through it alone, dL/dα = T (slope − B) and B moves to
-    B + α (slope − B) in front: no division by 1 − α.
+    With B the slope of all that lies behind, as seen through it alone, dL/dα = T (slope − B) and B
+    moves to B + α (slope − B) in front: no division by 1 − α.
     """
     behind, ceiling, ln2 = splat(ZERO), splat(max_alpha), splat(LN2)
     for m in range(count - 1, -1, -1):
@@ -56,9 +59,11 @@ def unwind(alphas, weights, out, count, max_alpha):
 
 @lanes
 def record_colors(weights, tall_grads, channels, count, cell, slots, records):
-    """records[slots[m], N_GEOMETRY:] += Σ_lanes weights[m] tall_grads: by cell, 16 rows of D `channels` and a margin.
+    """records[slots[m], N_GEOMETRY:] += Σ_lanes weights[m] tall_grads: by cell, 16 rows of D
+    `channels` and a margin.
 
-    The records have a multiple of four columns for them; what the last ones take up beyond D is never read.
+    The records have a multiple of four columns for them; what the last ones take up beyond D is
+    never read.
     """
     row, at, step = channels, cell * (LANES * channels + LANES), records.shape[1]
     channels = padded(channels)
@@ -79,12 +84,16 @@ def record_colors(weights, tall_grads, channels, count, cell, slots, records):
 
 @lanes
 def add_slopes_of_means(splats, column, ranks, start, rows, count, cell, mean_grads, out):
-    """out[m] += the cell's gradient [cells, E] times Gaussian m's cell channels, the same at every lane."""
+    """out[m] += the cell's gradient [cells, E] times Gaussian m's cell channels, the same at every
+    lane.
+    """
     for m in range(count):
         offset = np.int64(ranks[start + rows[m]]) * splats.shape[1] + column
         slope = splat(ZERO)
         for d in range(0, mean_grads.shape[1], LANES):
-            slope = fma(load(splats, offset + d), load(mean_grads, cell * mean_grads.shape[1] + d), slope)
+            slope = fma(
+                load(splats, offset + d), load(mean_grads, cell * mean_grads.shape[1] + d), slope
+            )
         store(out, LANES * m, load(out, LANES * m) + splat(total(slope)))
 
 
@@ -127,7 +136,9 @@ def record_geometry(g, count, cell, slots, records):
 
 @lanes
 def whiten(records, at, shapes, k):
-    """Turn a record's moments in (x, y) into those in (u, v), in float64: Σ g (1, u, v, u², uv, v²)."""
+    """Turn a record's moments in (x, y) into those in (u, v), in float64: Σ g (1, u, v, u², uv,
+    v²).
+    """
     p, q, r = np.float64(shapes[k, 0]), np.float64(shapes[k, 1]), np.float64(shapes[k, 2])
     u, v = np.float64(shapes[k, 3]), np.float64(shapes[k, 4])
     g_0, x, y, xx, xy, yy = (

@@ -1,9 +1,11 @@
 """Compositing inside one cell: 4×4 pixels, the 16 lanes of every vector.
 
-At an offset d from a Gaussian's mean, (u, v) = W d and log₂ α = log₂ opacity − u² − v², with W = [[p, q], [0, r]] (see
-`ellipses`). A tile holds 16 cells and, for each of its Gaussians, a row of `shapes`: p, q, r, then u and v at the
-middle of the tile, log₂ opacity, and from SHAPE on the channels. Sweeping a cell lists the Gaussians that contribute to
-it, with α and the weight α T by lane; what remains are products of small dense matrices, whose sums stay in registers.
+At an offset d from a Gaussian's mean, (u, v) = W d and log₂ α = log₂ opacity − u² − v², with W =
+[[p, q], [0, r]] (see `ellipses`). A tile holds 16 cells and, for each of its Gaussians, a row of
+`shapes`: p, q, r, then u and v at the middle of the tile, log₂ opacity, and from SHAPE on the
+  channels. Sweeping a cell lists the Gaussians that contribute to
+it, with α and the weight α T by lane; what remains are products of small dense matrices, whose sums
+stay in registers.
 """
 
 from __future__ import annotations
@@ -39,16 +41,20 @@ T_MIN, LOG2_ALPHA_MIN = np.float32(1e-4), np.float32(math.log2(1 / 255))
 REACH = np.float32(math.log2(255) + 1e-3)  # beyond the ellipse α = 1/255, with slack for rounding
 LN2, NEVER = np.float32(math.log(2)), np.float32(np.inf)
 ZERO, ONE, TWO, SHIFT = np.float32(0), np.float32(1), np.float32(2), np.float32(1.5 * 2**23)
-# Offsets of the lanes from their cell's first pixel and middle, and of the cells' middles from their tile's.
+# Offsets of the lanes from their cell's first pixel and middle, and of the cells' middles from
+# their tile's.
 IN_X, IN_Y = (np.arange(LANES) % 4).astype(np.float32), (np.arange(LANES) // 4).astype(np.float32)
 LANE_X, LANE_Y = IN_X - np.float32(1.5), IN_Y - np.float32(1.5)
 CELL_X, CELL_Y = 4 * LANE_X, 4 * LANE_Y
 _x, _y = CELL_X[:, None] + LANE_X, CELL_Y[:, None] + LANE_Y
-MOMENTS = np.stack([_x**0, _x, _y, _x**2, _x * _y, _y**2, 0 * _x, 0 * _x], -1)  # [cells, lanes, SHAPE]
+# [cells, lanes, SHAPE]
+MOMENTS = np.stack([_x**0, _x, _y, _x**2, _x * _y, _y**2, 0 * _x, 0 * _x], -1)
 IN_ORDER = np.arange(BLOCK)
 # 2^f on [-½, ½] to 2e-7, by Chebyshev interpolation
 _nodes = 0.5 * np.cos((np.arange(6) + 0.5) * np.pi / 6)
-E0, E1, E2, E3, E4, E5 = (np.float32(c) for c in np.polynomial.polynomial.polyfit(_nodes, 2.0**_nodes, 5))
+E0, E1, E2, E3, E4, E5 = (
+    np.float32(c) for c in np.polynomial.polynomial.polyfit(_nodes, 2.0**_nodes, 5)
+)
 
 
 @inline
@@ -88,8 +94,9 @@ def reach(shapes, k):
 
 @lanes
 def begin(states, width, height):
-    """Fill the states [cells, 2, 16] of a tile of which the image holds width × height pixels: T, which is 1, and
-    the least log₂ α that is seen, which is infinite outside the image, and once a pixel is done.
+    """Fill the states [cells, 2, 16] of a tile of which the image holds width × height pixels: T,
+    which is 1, and the least log₂ α that is seen, which is infinite outside the image, and once a
+    pixel is done.
     """
     for cell in range(LANES):
         left, top = corner(cell)
@@ -108,7 +115,9 @@ def is_done(states, cell):
 
 @lanes
 def listed(masks, at, n, cell, hits):
-    """Which of masks[at : at + n] hold this cell, into `hits`; both have 16 more. Returns how many."""
+    """Which of masks[at : at + n] hold this cell, into `hits`; both have 16 more. Returns how
+    many.
+    """
     count = 0
     for k in range(0, n, LANES):
         count = hits_among(masks, at + k, n - k, cell, k, hits, count)
@@ -120,17 +129,24 @@ def _exp2(power):
     """2^power, for -100 <= power <= 100; anything below."""
     shifted = power + splat(SHIFT)
     f = power - (shifted - splat(SHIFT))
-    series = fma(f, fma(f, fma(f, fma(f, fma(f, splat(E5), splat(E4)), splat(E3)), splat(E2)), splat(E1)), splat(E0))
+    series = fma(
+        f,
+        fma(f, fma(f, fma(f, fma(f, splat(E5), splat(E4)), splat(E3)), splat(E2)), splat(E1)),
+        splat(E0),
+    )
     return scale_by_power(series, shifted)
 
 
 @lanes
 def sweep(shapes, hits, n, cell, max_alpha, states, alphas, weights, rows):
-    """Composite one cell front to back, α and α T of what contributes into rows [16] of `alphas` and `weights`.
+    """Composite one cell front to back, α and α T of what contributes into rows [16] of `alphas`
+    and `weights`.
 
-    Args: hits [n] rows of `shapes`; states as `begin` fills them; alphas, weights and rows have room for n.
+    Args: hits [n] rows of `shapes`; states as `begin` fills them; alphas, weights and rows have
+      room for n.
     Returns: how many contribute; rows[:count] says which.
-    Choices: no branch on whether a Gaussian contributes: the next one's row takes its place where it does not.
+    Choices: no branch on whether a Gaussian contributes: the next one's row takes its place where
+      it does not.
     """
     x, y = load(LANE_X, 0) + splat(CELL_X[cell]), load(LANE_Y, 0) + splat(CELL_Y[cell])
     t, least = load(states, 2 * LANES * cell), load(states, 2 * LANES * cell + LANES)
@@ -161,7 +177,9 @@ def sweep(shapes, hits, n, cell, max_alpha, states, alphas, weights, rows):
 
 @lanes
 def accumulate(shapes, rows, weights, count, cell, sums):
-    """sums[cell, c] += Σ_m shapes[rows[m], SHAPE + c] weights[m]: [cells, channels, 16], channels in fours."""
+    """sums[cell, c] += Σ_m shapes[rows[m], SHAPE + c] weights[m]: [cells, channels, 16], channels
+    in fours.
+    """
     channels, step = sums.shape[1], shapes.shape[1]
     for c in range(0, channels - 7, BLOCK):
         at = LANES * (cell * channels + c)
@@ -183,7 +201,9 @@ def sum_lanes(weights, count, sums):
 
 @lanes
 def accumulate_means(splats, column, ranks, start, rows, shares, count, cell, sums):
-    """sums[cell] += Σ_m shares[m] splats[m, column:]: the cell channels, [cells, E], E a multiple of 16."""
+    """sums[cell] += Σ_m shares[m] splats[m, column:]: the cell channels, [cells, E], E a multiple
+    of 16.
+    """
     for d in range(0, sums.shape[1], LANES):
         at = cell * sums.shape[1] + d
         summed = load(sums, at)

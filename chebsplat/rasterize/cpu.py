@@ -15,14 +15,19 @@ NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "c
 
 
 class _Project(torch.autograd.Function):
-    """means2d [N, 2], covariances [N, 3] and compensations [N] of one view; the rest comes without gradient.
+    """means2d [N, 2], covariances [N, 3] and compensations [N] of one view; the rest comes without
+    gradient.
 
-    What comes back for `covariances`, which stay between the two Functions, is not their gradient but the whitened
-    moments that `ellipses.project_adjoint` takes: they keep the precision that the gradient would lose.
+    What comes back for `covariances`, which stay between the two Functions, is not their gradient
+    but the whitened
+    moments that `ellipses.project_adjoint` takes: they keep the precision that the gradient would
+      lose.
     """
 
     @staticmethod
-    def forward(ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, camera: tuple[Any, ...]) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, camera: tuple[Any, ...]
+    ) -> tuple[Tensor, ...]:
         gaussians = [t.detach().contiguous().numpy() for t in (means, quats, scales)]
         projected = [torch.from_numpy(a) for a in ellipses.project(*gaussians, *camera)]
         means2d, covariances, whitening, conics, depths, radii, compensations = projected
@@ -31,14 +36,18 @@ class _Project(torch.autograd.Function):
         return means2d, covariances, whitening, conics, depths, radii, compensations
 
     @staticmethod
-    def backward(ctx: Any, grad_means2d: Tensor, moments: Tensor, *others: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(
+        ctx: Any, grad_means2d: Tensor, moments: Tensor, *others: Tensor
+    ) -> tuple[Tensor | None, ...]:
         slopes = [g.contiguous().numpy() for g in (grad_means2d, moments, others[-1])]
         gradients = ellipses.project_adjoint(*ctx.gaussians, *ctx.camera, ctx.radii, *slopes)
         return *(torch.from_numpy(a) for a in gradients), None
 
 
 class _Composite(torch.autograd.Function):
-    """Render [H, W, D], means over cells, and alpha [H, W] of one view; backward also adds to `absgrad` if given."""
+    """Render [H, W, D], means over cells, and alpha [H, W] of one view; backward also adds to
+    `absgrad` if given.
+    """
 
     @staticmethod
     def forward(
@@ -47,10 +56,16 @@ class _Composite(torch.autograd.Function):
         max_alpha: float, view: int,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         centers, spreads, strengths, whitened, z, reach = (
-            t.detach().contiguous().numpy() for t in (means2d, covariances, opacities, whitening, depths, radii)
+            t.detach().contiguous().numpy()
+            for t in (means2d, covariances, opacities, whitening, depths, radii)
         )
-        channels, in_cells = colors.detach().contiguous().numpy(), cell_colors.detach().contiguous().numpy()
-        bins = binning.bin_gaussians(centers, spreads, z, reach, strengths, channels, in_cells, *size)
+        channels, in_cells = (
+            colors.detach().contiguous().numpy(),
+            cell_colors.detach().contiguous().numpy(),
+        )
+        bins = binning.bin_gaussians(
+            centers, spreads, z, reach, strengths, channels, in_cells, *size
+        )
         splats = tiles.pack(bins.order, centers, whitened, strengths, channels, in_cells)
         limit = np.float32(max_alpha)
         counts = channels.shape[1], in_cells.shape[1]
@@ -58,7 +73,11 @@ class _Composite(torch.autograd.Function):
         render, cells, transmittance, masks, used = composed
         ctx.arrays, ctx.absgrad = (len(centers), splats, *bins, masks, used, limit), absgrad
         ctx.view = view
-        return torch.from_numpy(render), torch.from_numpy(cells), 1 - torch.from_numpy(transmittance)
+        return (
+            torch.from_numpy(render),
+            torch.from_numpy(cells),
+            1 - torch.from_numpy(transmittance),
+        )
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
@@ -66,7 +85,9 @@ class _Composite(torch.autograd.Function):
         *gradients, finite = tiles_adjoint.backward(*ctx.arrays, *slopes, ctx.absgrad is not None)
         if not finite:
             raise ValueError(f"the gradient of the image of view {ctx.view} is not finite")
-        to_means2d, moments, to_opacities, absolute, *to_channels = (torch.from_numpy(a) for a in gradients)
+        to_means2d, moments, to_opacities, absolute, *to_channels = (
+            torch.from_numpy(a) for a in gradients
+        )
         if ctx.absgrad is not None:
             ctx.absgrad += absolute
         return to_means2d, moments, to_opacities, *to_channels, *[None] * 7
@@ -94,15 +115,19 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """As `reference.rasterize`, in float32, and fast.
 
-    Raises: ValueError unless all inputs are float32 on the CPU, if a gradient to a camera is asked for, or, in
-      backward, on a gradient of the image that is not finite.
-    Choices: `conics`, `depths` and `radii` have no gradient here. Bitwise equal for any number of threads.
+    Raises: ValueError unless all inputs are float32 on the CPU, if a gradient to a camera is asked
+      for, or, in backward, on a gradient of the image that is not finite.
+    Choices: `conics`, `depths` and `radii` have no gradient here. Bitwise equal for any number of
+      threads.
     """
     in_cells = torch.zeros(len(means), 0) if cell_colors is None else cell_colors
     inputs = means, quats, scales, opacities, colors, viewmats, Ks, in_cells
     for name, tensor in zip(NAMES, inputs, strict=True):
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise ValueError(f"{name} is {tensor.dtype} on {tensor.device}; the cpu backend takes float32 on the CPU")
+            raise ValueError(
+                f"{name} is {tensor.dtype} on {tensor.device}; the cpu backend takes "
+                "float32 on the CPU"
+            )
     if viewmats.requires_grad or Ks.requires_grad:
         raise ValueError("the cpu backend gives cameras no gradient: use the reference")
     antialiased = is_antialiased(rasterize_mode)

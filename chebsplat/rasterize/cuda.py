@@ -40,28 +40,48 @@ def rasterize(
     """As `reference.rasterize`, of float32 tensors on a GPU.
 
     Args: harmless: the Gaussians are those that `made_harmless` returns.
-    Raises: ValueError unless the Gaussians are float32 on a GPU, for a `max_alpha` above 0.999, or beyond 512 channels;
-      ImportError, with the remedy, without gsplat.
-    Choices: gsplat fixes the ceiling of alpha at 0.999; a lower one is kept by what a Gaussian's opacity is at most,
-      so that no alpha exceeds it. Renders are those of the other backends where no opacity is above `max_alpha`;
-      where one is, alpha is the same at its middle and lower by up to a hundredth around it. The gradient passes as
-      if there were no ceiling: a Gaussian that has reached it can become fainter again. What lies in the near plane
-      is cut, as elsewhere. Covariances are float32: a needle a billion times as long as wide is drawn wider than it
-      is. All channels go at once: of gsplat's chunks only one would leave its absolute gradient. A broken Gaussian is
+    Raises: ValueError unless the Gaussians are float32 on a GPU, for a `max_alpha` above 0.999, or
+      beyond 512 channels; ImportError, with the remedy, without gsplat.
+    Choices: gsplat fixes the ceiling of alpha at 0.999; a lower one is kept by what a Gaussian's
+      opacity is at most, so that no alpha exceeds it. Renders are those of the other backends where
+      no opacity is above `max_alpha`; where one is, alpha is the same at its middle and lower by up
+      to a hundredth around it. The gradient passes as
+      if there were no ceiling: a Gaussian that has reached it can become fainter again. What lies
+        in the near plane
+      is cut, as elsewhere. Covariances are float32: a needle a billion times as long as wide is
+        drawn wider than it
+      is. All channels go at once: of gsplat's chunks only one would leave its absolute gradient. A
+        broken Gaussian is
       replaced by one that nobody sees, because gsplat would draw a NaN opaque.
     """
     is_antialiased(rasterize_mode)
     if means.dtype != torch.float32 or means.device.type != "cuda":
-        raise ValueError(f"means is {means.dtype} on {means.device}; the cuda backend takes float32 on a GPU")
+        raise ValueError(
+            f"means is {means.dtype} on {means.device}; the cuda backend takes float32 on a GPU"
+        )
     n_colors, colors = colors.shape[-1], reference.with_cells(colors, cell_colors)
     if max_alpha > MAX_ALPHA:
         raise ValueError(f"max_alpha {max_alpha}; the cuda backend keeps none above {MAX_ALPHA}")
     if colors.shape[-1] > MOST:
-        raise ValueError(f"{colors.shape[-1]} channels; the cuda backend takes at most {MOST} channels")
+        raise ValueError(
+            f"{colors.shape[-1]} channels; the cuda backend takes at most {MOST} channels"
+        )
     rasterization = gsplat().rasterization
     if len(means) == 0:  # the background: gsplat is not asked to sort an empty scene
-        empty = (means, quats, scales, opacities, colors[..., :n_colors], viewmats, Ks, width, height)
-        return reference.rasterize(*empty, backgrounds=backgrounds, absgrad=absgrad, cell_colors=cell_colors)
+        empty = (
+            means,
+            quats,
+            scales,
+            opacities,
+            colors[..., :n_colors],
+            viewmats,
+            Ks,
+            width,
+            height,
+        )
+        return reference.rasterize(
+            *empty, backgrounds=backgrounds, absgrad=absgrad, cell_colors=cell_colors
+        )
     if backgrounds is not None:
         backgrounds = torch.nn.functional.pad(backgrounds, (0, colors.shape[-1] - n_colors))
     gaussians = (means, quats, scales, opacities, colors)
@@ -81,17 +101,31 @@ def rasterize(
 
 
 def made_harmless(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, max_alpha: float = 0.99
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    max_alpha: float = 0.99,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Gaussians that gsplat draws as the other backends do: opacities at most `max_alpha`, with a gradient as if there
-    were no ceiling, and 0 where a value is not finite or there is no rotation; quaternions scaled.
+    """Gaussians that gsplat draws as the other backends do: opacities at most `max_alpha`, with a
+    gradient as if there were no ceiling, and 0 where a value is not finite or there is no rotation;
+    quaternions scaled.
 
-    Choices: a Gaussian's values are looked at together, by their sum, which is finite where each of them is (or takes
-      one for broken whose values are beyond all measure): each question to a GPU takes as long as a sum.
+    Choices: a Gaussian's values are looked at together, by their sum, which is finite where each of
+      them is (or takes
+      one for broken whose values are beyond all measure): each question to a GPU takes as long as a
+        sum.
     """
     opacities = opacities + (opacities.clamp_max(max_alpha) - opacities).detach()
     by_camera = colors.ndim == 3
-    columns = [means, quats, scales, opacities[:, None], colors.movedim(0, 1).flatten(1) if by_camera else colors]
+    columns = [
+        means,
+        quats,
+        scales,
+        opacities[:, None],
+        colors.movedim(0, 1).flatten(1) if by_camera else colors,
+    ]
     values = torch.cat(columns, 1)
     longest = quats.detach().abs().amax(-1)
     whole = torch.isfinite(values.detach().sum(1)) & (longest > 1e-12)
@@ -109,4 +143,9 @@ def own_meta(gsplat_meta: dict[str, Any]) -> dict[str, Any]:
     if means2d.requires_grad:
         means2d.retain_grad()
     radii = radii.amax(-1) if radii.ndim == 3 else radii
-    return {"means2d": means2d, "conics": gsplat_meta["conics"], "depths": gsplat_meta["depths"], "radii": radii}
+    return {
+        "means2d": means2d,
+        "conics": gsplat_meta["conics"],
+        "depths": gsplat_meta["depths"],
+        "radii": radii,
+    }

@@ -1,7 +1,10 @@
-"""Where a ray meets the surface that Gaussians show: their planes' depth, late in what the pixel is made of.
+"""Where a ray meets the surface that Gaussians show: their planes' depth, late in what the pixel is
+made of.
 
-Gaussians of a wall overlap in depth and each covers little, so the first ones that a ray meets already take part of its
-weight: the mean over all lies in front of the wall. The surface is where most of the light has been gathered.
+Gaussians of a wall overlap in depth and each covers little, so the first ones that a ray meets
+already take part of its
+weight: the mean over all lies in front of the wall. The surface is where most of the light has been
+  gathered.
 """
 
 from __future__ import annotations
@@ -81,19 +84,25 @@ def depths(
     planes: np.ndarray,
     part: tuple[float, float] = COVERED,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of the surface, f32 [H, W] in scene units, inf where there is none, and how much is covered [H, W].
+    """Depth of the surface, f32 [H, W] in scene units, inf where there is none, and how much is
+    covered [H, W].
 
     Args:
       gaussians: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], activated, float32.
-      viewmat:   [4, 4] world to camera, OpenCV axes; K [3, 3] pixels; size: width and height, pixels.
+      viewmat:   [4, 4] world to camera, OpenCV axes; K [3, 3] pixels; size: width and height,
+        pixels.
       planes:    q [N, 3] of each Gaussian, 1 / z = q · (u, v, 1) (`splats.planes.inverse_depths`).
       part:      of Σ α T of a pixel, front to back, which tells its depth; (0, 1) is the mean.
-    Choices: inverse depth is averaged within the part. In a finished room whose Gaussians have a median opacity of .25
-      the mean lies 3 cm in front of the surface, with a median error of 4 cm; between .7 and .9 that is 1.6 cm.
+    Choices: inverse depth is averaged within the part. In a finished room whose Gaussians have a
+      median opacity of .25 the mean lies 3 cm in front of the surface, with a median error of 4 cm;
+      between .7 and .9 that is 1.6 cm.
     """
     bins, splats = binned(gaussians, viewmat, K, size, np.ascontiguousarray(planes, np.float32))
     width, height = size
-    depth, covered = np.full((height, width), np.inf, np.float32), np.zeros((height, width), np.float32)
+    depth, covered = (
+        np.full((height, width), np.inf, np.float32),
+        np.zeros((height, width), np.float32),
+    )
     low, high = (np.float32(bound) for bound in part)
     _depths(splats, bins.tile_starts, bins.rank, low, high, depth, covered)
     return depth, covered

@@ -1,7 +1,9 @@
-"""Numba twin of `projection.project` for one view, and its adjoint: parallel over Gaussians, float64 inside.
+"""Numba twin of `projection.project` for one view, and its adjoint: parallel over Gaussians,
+float64 inside.
 
-Beside mean and covariance each Gaussian gets its whitening W = [[p, q], [0, r]], WᵀW = ½ log₂e Σ⁻¹, so that at an
-offset d from the mean log₂ α = log₂ opacity − |W d|². W comes from the determinant by Cauchy-Binet, which cannot
+Beside mean and covariance each Gaussian gets its whitening W = [[p, q], [0, r]], WᵀW = ½ log₂e Σ⁻¹,
+so that at an offset d from the mean log₂ α = log₂ opacity − |W d|². W comes from the determinant by
+Cauchy-Binet, which cannot
 cancel, and gradients are gathered in W d: a needle's are as exact as a ball's.
 """
 
@@ -16,7 +18,8 @@ from chebsplat.kernels.jit import body, inline, kernel, prange
 HALF_LOG2E = 0.5 * math.log2(math.e)
 LN2 = math.log(2.0)
 PARTS = 64  # of the Gaussians: each has scratch of its own
-LARGEST, EXTENT, LEAST_KEPT = 1e30, 3.33, 0.005  # as `projection`'s, which numba's cache could not follow
+# as `projection`'s, which numba's cache could not follow
+LARGEST, EXTENT, LEAST_KEPT = 1e30, 3.33, 0.005
 
 
 @inline
@@ -43,9 +46,21 @@ def _rotation(quat, unit, out):
     for k in range(4):
         unit[k] *= shrink
     w, x, y, z = unit[0], unit[1], unit[2], unit[3]
-    out[0, 0], out[0, 1], out[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    out[1, 0], out[1, 1], out[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    out[2, 0], out[2, 1], out[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    out[0, 0], out[0, 1], out[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    out[1, 0], out[1, 1], out[1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    out[2, 0], out[2, 1], out[2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
     return largest * root
 
 
@@ -58,7 +73,9 @@ def _clamped(slope, center, focal, size):
 
 @inline
 def _jacobian(point, viewmat, K, width, height, out, jacobian):
-    """Fill the camera-space point [3] into `out` and d(pixel)/d(camera) [2, 3], slopes clamped, into `jacobian`."""
+    """Fill the camera-space point [3] into `out` and d(pixel)/d(camera) [2, 3], slopes clamped,
+    into `jacobian`.
+    """
     for i in range(3):
         out[i] = viewmat[i, 3]
         for k in range(3):
@@ -82,12 +99,18 @@ def _squared(jacobian):
 
 @inline
 def _cross(a, b, out):
-    out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    out[0], out[1], out[2] = (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
 
 
 @inline
 def _ellipse(factor, eps2d, cross):
-    """F Fᵀ + ε I: xx, xy, yy, the determinant by Cauchy-Binet, and |f × g| of F's rows; f × g goes into `cross`."""
+    """F Fᵀ + ε I: xx, xy, yy, the determinant by Cauchy-Binet, and |f × g| of F's rows; f × g goes
+    into `cross`.
+    """
     a = b = c = 0.0
     for k in range(3):
         a += factor[0, k] * factor[0, k]
@@ -106,7 +129,12 @@ def _project(
 ):  # fmt: skip
     """`project` of the Gaussians from `first` up to `last`, into what it returns."""
     unit, camera, cross = np.empty(4), np.empty(3), np.empty(3)
-    rotation, jacobian, screen, factor = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3))
+    rotation, jacobian, screen, factor = (
+        np.empty((3, 3)),
+        np.empty((2, 3)),
+        np.empty((2, 3)),
+        np.empty((2, 3)),
+    )
     for i in range(first, last):
         depth = viewmat[2, 3]
         for k in range(3):
@@ -116,11 +144,14 @@ def _project(
         _jacobian(means[i], viewmat, K, width, height, camera, jacobian)
         u, v = jacobian[0, 0] * camera[0] + K[0, 2], jacobian[1, 1] * camera[1] + K[1, 2]
         size = max(max(abs(scales[i, 0]), abs(scales[i, 1])), abs(scales[i, 2]))
-        steepest = size * size * _squared(jacobian)  # at least the covariance's largest eigenvalue, without ε
+        # at least the covariance's largest eigenvalue, without ε
+        steepest = size * size * _squared(jacobian)
         farthest = EXTENT * math.sqrt(steepest + eps2d) + 2  # at least `reach` below
         if u + farthest < 0 or u - farthest > width or v + farthest < 0 or v - farthest > height:
             continue
-        largest = max(max(abs(quats[i, 0]), abs(quats[i, 1])), max(abs(quats[i, 2]), abs(quats[i, 3])))
+        largest = max(
+            max(abs(quats[i, 0]), abs(quats[i, 1])), max(abs(quats[i, 2]), abs(quats[i, 3]))
+        )
         sums = 1.0 * quats[i, 0] + quats[i, 1] + quats[i, 2] + quats[i, 3]
         if not (largest > 1e-12 and math.isfinite(largest) and math.isfinite(sums - sums)):
             continue
@@ -143,7 +174,11 @@ def _project(
         conics[i, 0], conics[i, 1], conics[i, 2] = c * over, -b * over, a * over
         compensations[i] = max(area * math.sqrt(over), LEAST_KEPT)
         p, under = math.sqrt(HALF_LOG2E * c * over), 1.0 / c
-        whitening[i, 0], whitening[i, 1], whitening[i, 2] = p, -p * b * under, math.sqrt(HALF_LOG2E * under)
+        whitening[i, 0], whitening[i, 1], whitening[i, 2] = (
+            p,
+            -p * b * under,
+            math.sqrt(HALF_LOG2E * under),
+        )
 
 
 @kernel
@@ -151,19 +186,38 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
     """Ellipses of one view.
 
     Args: means, scales [N, 3], quats [N, 4] float32; viewmat [4, 4], K [3, 3] float64.
-    Returns: float32 means2d [N, 2], covariances [N, 3] (xx, xy, yy; ε included), whitening [N, 3] (p, q, r),
-      conics [N, 3], depths [N]; radii [N] i32; compensations [N] f32, √(det Σ / det(Σ + ε I)), at least
-      LEAST_KEPT. Rows of culled Gaussians are zero; a visible one's radius is not.
+    Returns: float32 means2d [N, 2], covariances [N, 3] (xx, xy, yy; ε included), whitening [N, 3]
+      (p, q, r), conics [N, 3], depths [N]; radii [N] i32; compensations [N] f32, √(det Σ / det(Σ +
+      ε I)), at least LEAST_KEPT. Rows of culled Gaussians are zero; a visible one's radius is not.
     """
     n = len(means)
     means2d, covariances = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
     whitening, conics = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
-    depths, radii, compensations = np.zeros(n, np.float32), np.zeros(n, np.int32), np.zeros(n, np.float32)
+    depths, radii, compensations = (
+        np.zeros(n, np.float32),
+        np.zeros(n, np.int32),
+        np.zeros(n, np.float32),
+    )
     turn = np.ascontiguousarray(viewmat[:3, :3])
     out = means2d, covariances, whitening, conics, depths, radii, compensations
     for part in prange(PARTS):
         first, last = part * n // PARTS, (part + 1) * n // PARTS
-        _project(means, quats, scales, viewmat, turn, K, width, height, near_plane, far_plane, eps2d, first, last, *out)
+        _project(
+            means,
+            quats,
+            scales,
+            viewmat,
+            turn,
+            K,
+            width,
+            height,
+            near_plane,
+            far_plane,
+            eps2d,
+            first,
+            last,
+            *out,
+        )
     return out
 
 
@@ -173,9 +227,24 @@ def _rotation_adjoint(unit, length, by, out):
     w, x, y, z = unit[0], unit[1], unit[2], unit[3]
     skew_x, skew_y, skew_z = by[2, 1] - by[1, 2], by[0, 2] - by[2, 0], by[1, 0] - by[0, 1]
     out[0] = 2 * (x * skew_x + y * skew_y + z * skew_z)
-    out[1] = 2 * (w * skew_x + y * (by[0, 1] + by[1, 0]) + z * (by[0, 2] + by[2, 0]) - 2 * x * (by[1, 1] + by[2, 2]))
-    out[2] = 2 * (w * skew_y + x * (by[0, 1] + by[1, 0]) + z * (by[1, 2] + by[2, 1]) - 2 * y * (by[0, 0] + by[2, 2]))
-    out[3] = 2 * (w * skew_z + x * (by[0, 2] + by[2, 0]) + y * (by[1, 2] + by[2, 1]) - 2 * z * (by[0, 0] + by[1, 1]))
+    out[1] = 2 * (
+        w * skew_x
+        + y * (by[0, 1] + by[1, 0])
+        + z * (by[0, 2] + by[2, 0])
+        - 2 * x * (by[1, 1] + by[2, 2])
+    )
+    out[2] = 2 * (
+        w * skew_y
+        + x * (by[0, 1] + by[1, 0])
+        + z * (by[1, 2] + by[2, 1])
+        - 2 * y * (by[0, 0] + by[2, 2])
+    )
+    out[3] = 2 * (
+        w * skew_z
+        + x * (by[0, 2] + by[2, 0])
+        + y * (by[1, 2] + by[2, 1])
+        - 2 * z * (by[0, 0] + by[1, 1])
+    )
     along = out[0] * w + out[1] * x + out[2] * y + out[3] * z
     shrink = 1.0 / length
     for k in range(4):
@@ -189,9 +258,10 @@ def _project_adjoint(
 ):  # fmt: skip
     """`project_adjoint` of the Gaussians from `first` up to `last`, into what it returns.
 
-    The gradient to the factor F of Σ is 2 / (½ log₂e) Wᵀ M (W F): W F is bounded, while gradients to Σ itself would
-    have to cancel over the needle's length. The compensation is |f × g| / √det of F's rows f and g; its gradient is
-    taken at the unit normal f × g / |f × g|, which stays bounded as the ellipse flattens, and is 0 below its floor.
+    The gradient to the factor F of Σ is 2 / (½ log₂e) Wᵀ M (W F): W F is bounded, while gradients
+    to Σ itself would have to cancel over the needle's length. The compensation is |f × g| / √det of
+    F's rows f and g; its gradient is taken at the unit normal f × g / |f × g|, which stays bounded
+    as the ellipse flattens, and is 0 below its floor.
     """
     unit, camera, normal, across = np.empty(4), np.empty(3), np.empty(3), np.empty((2, 3))
     rotation, jacobian, screen = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
@@ -212,7 +282,11 @@ def _project_adjoint(
         under = 1.0 / c
         p, r = math.sqrt(HALF_LOG2E * c / determinant), math.sqrt(HALF_LOG2E * under)
         q = -p * b * under
-        uu, uv, vv = 2 / HALF_LOG2E * moments[i, 0], 2 / HALF_LOG2E * moments[i, 1], 2 / HALF_LOG2E * moments[i, 2]
+        uu, uv, vv = (
+            2 / HALF_LOG2E * moments[i, 0],
+            2 / HALF_LOG2E * moments[i, 1],
+            2 / HALF_LOG2E * moments[i, 2],
+        )
         for k in range(3):
             s = 1.0 * scales[i, k]
             axis_u, axis_v = p * axes[0, k] + q * axes[1, k], r * axes[1, k]
@@ -236,7 +310,10 @@ def _project_adjoint(
         _matmul(screen.T, by_axes, by_rotation, 3, 2, 3)
         _matmul(by_screen, turn.T, by_jacobian, 2, 3, 3)
         x, y, near, fx, fy = camera[0], camera[1], 1.0 / camera[2], K[0, 0], K[1, 1]
-        slope_x, slope_y = _clamped(x * near, K[0, 2], fx, width), _clamped(y * near, K[1, 2], fy, height)
+        slope_x, slope_y = (
+            _clamped(x * near, K[0, 2], fx, width),
+            _clamped(y * near, K[1, 2], fy, height),
+        )
         by_x, by_y = fx * near * grad_means2d[i, 0], fy * near * grad_means2d[i, 1]
         by_z = -(by_x * x + by_y * y) * near
         steep_x, steep_y = fx * near * near, fy * near * near
@@ -258,12 +335,23 @@ def _project_adjoint(
 
 @kernel
 def project_adjoint(
-    means, quats, scales, viewmat, K, width, height, eps2d, radii, grad_means2d, moments, grad_compensations
+    means,
+    quats,
+    scales,
+    viewmat,
+    K,
+    width,
+    height,
+    eps2d,
+    radii,
+    grad_means2d,
+    moments,
+    grad_compensations,
 ):
     """Gradients [N, 3], [N, 4], [N, 3] to means, quats and scales; zero rows where culled.
 
-    Args: grad_means2d [N, 2]; moments [N, 3]: uu, uv, vv of Σ g (W d)(W d)ᵀ over a Gaussian's pixels;
-      grad_compensations [N].
+    Args: grad_means2d [N, 2]; moments [N, 3]: uu, uv, vv of Σ g (W d)(W d)ᵀ over a Gaussian's
+      pixels; grad_compensations [N].
     """
     n = len(means)
     to_means, to_scales = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)

@@ -1,7 +1,9 @@
-"""The transpose of rendering cell means: what every cell of a view says, summed by the Gaussians that make it up.
+"""The transpose of rendering cell means: what every cell of a view says, summed by the Gaussians
+that make it up.
 
-A Gaussian's weight in a cell is the sum over its pixels of w = α T. As in `tiles_adjoint`, a tile fills the records of
-its pairs, and every Gaussian's records are summed in the order of its pairs: the same bits for any number of threads.
+A Gaussian's weight in a cell is the sum over its pixels of w = α T. As in `tiles_adjoint`, a tile
+fills the records of its pairs, and every Gaussian's records are summed in the order of its pairs:
+the same bits for any number of threads.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ MAX_ALPHA, NEAR, FAR, EPS2D = np.float32(0.99), 0.01, 1e10, 0.3  # as `reference
 
 
 class Lifted(NamedTuple):
-    """What one view says of M Gaussians: ids i32 [M], ascending; weights f32 [M] > 0; sums f32 [M, C]."""
+    """What one view says of M Gaussians: ids i32 [M], ascending; weights f32 [M] > 0; sums f32 [M,
+    C].
+    """
 
     ids: np.ndarray
     weights: np.ndarray
@@ -43,7 +47,9 @@ def gated(weights, count, gate):
 
 
 @serial
-def _lift_tile(splats, ranks, pair, start, stop, left, top, width, height, values, counts, gate, base, records):
+def _lift_tile(
+    splats, ranks, pair, start, stop, left, top, width, height, values, counts, gate, base, records
+):
     """One tile of `_lift`: adds to the records of its pairs."""
     n, across = stop - start, counts.shape[1]
     states = np.empty((LANES, 2, LANES), np.float32)
@@ -72,13 +78,20 @@ def _lift_tile(splats, ranks, pair, start, stop, left, top, width, height, value
 
 
 @kernel
-def _lift(splats, shown, tile_starts, ranks, pair, pair_starts, values, counts, width, height, gate):
-    """Sums f32 [shown, E] of values [cells, E], E a multiple of 16, by rank; a cell whose count is 0 is passed over."""
+def _lift(
+    splats, shown, tile_starts, ranks, pair, pair_starts, values, counts, width, height, gate
+):
+    """Sums f32 [shown, E] of values [cells, E], E a multiple of 16, by rank; a cell whose count is
+    0 is passed over.
+    """
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     bands, room = len(pair_starts), 0
     for band in range(bands):
         room = max(room, pair_starts[band, shown] - pair_starts[band, 0])
-    records, sums = np.empty((room, values.shape[1]), np.float32), np.zeros((shown, values.shape[1]), np.float32)
+    records, sums = (
+        np.empty((room, values.shape[1]), np.float32),
+        np.zeros((shown, values.shape[1]), np.float32),
+    )
     for band in range(bands):
         first_tile, base = band_start(band, rows) * columns, pair_starts[band, 0]
         n_tiles = band_start(band + 1, rows) * columns - first_tile
@@ -106,14 +119,18 @@ def binned(
     size: tuple[int, int],
     channels: np.ndarray | None = None,
 ) -> tuple[binning.Bins, np.ndarray]:
-    """The Gaussians that a view shows, by tile, and packed with their channels f32 [N, C]; arguments as of `lift`."""
+    """The Gaussians that a view shows, by tile, and packed with their channels f32 [N, C];
+    arguments as of `lift`.
+    """
     means, quats, scales, opacities = gaussians
     camera = (np.ascontiguousarray(matrix, np.float64) for matrix in (viewmat, K))
     projected = ellipses.project(means, quats, scales, *camera, *size, NEAR, FAR, EPS2D)
     means2d, covariances, whitening, _, depths, radii, _ = projected
     none = np.zeros((len(means), 0), np.float32)
     bins = binning.bin_gaussians(means2d, covariances, depths, radii, opacities, none, none, *size)
-    return bins, tiles.pack(bins.order, means2d, whitening, opacities, none if channels is None else channels, none)
+    return bins, tiles.pack(
+        bins.order, means2d, whitening, opacities, none if channels is None else channels, none
+    )
 
 
 def lift(
@@ -133,16 +150,22 @@ def lift(
       size:      width and height, pixels.
       values:    b [⌈H/4⌉, ⌈W/4⌉, C], of cells of 4×4 pixels.
       counts:    q [⌈H/4⌉, ⌈W/4⌉] >= 0, what each cell counts; where it is 0, b may be anything.
-      gate:      in [0, 1]: a pixel belongs to the Gaussians whose w in it is at least this part of the largest one's.
+      gate:      in [0, 1]: a pixel belongs to the Gaussians whose w in it is at least this part of
+        the largest one's.
     Returns: the Gaussians that have a weight, with Σ w q and Σ w q b.
-    Raises:  ValueError unless values and counts have a row for each cell, and are finite where they count.
-    Choices: w as `reference.rasterize` composites by default. The gate compares within each pixel: that of a whole
-      cell would hand a pixel at an edge to the larger side. Bitwise equal for any number of threads.
+    Raises:  ValueError unless values and counts have a row for each cell, and are finite where they
+      count.
+    Choices: w as `reference.rasterize` composites by default. The gate compares within each pixel:
+      that of a whole cell would hand a pixel at an edge to the larger side. Bitwise equal for any
+      number of threads.
     """
     width, height = size
     shape = (height + 3) // 4, (width + 3) // 4
     if values.shape[:2] != shape or counts.shape != shape:
-        raise ValueError(f"values {values.shape}, counts {counts.shape}; {width}×{height} pixels have cells {shape}")
+        raise ValueError(
+            f"values {values.shape}, counts {counts.shape}; {width}×{height} pixels "
+            f"have cells {shape}"
+        )
     n_channels = values.shape[2]
     counted = counts > 0
     said = np.zeros((*shape, int(cells.whole(n_channels + 1))), np.float32)

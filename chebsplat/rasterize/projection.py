@@ -12,7 +12,8 @@ from chebsplat.splats.rotations import rotation_matrices
 EXTENT = 3.33  # in σ: there even a Gaussian of opacity 1 has fallen to 1/255, √(2 ln 255)
 CELL = 4  # pixels, the side of a cell of `cell_colors`
 LEAST_KEPT = 0.005  # of an opacity that is compensated: 3DGS's and gsplat's floor
-LARGEST = 1e30  # of a projected variance, pixels²: more is culled, so that float32 can hold what is made of it
+# of a projected variance, pixels²: more is culled, so that float32 can hold what is made of it
+LARGEST = 1e30
 
 
 class Projected(NamedTuple):
@@ -21,8 +22,10 @@ class Projected(NamedTuple):
     means2d: Tensor  # [N, 2] pixels; pixel centres are at half integers
     covariances: Tensor  # [N, 3] xx, xy, yy of the 2D covariance, ε included, pixels²
     conics: Tensor  # [N, 3] upper triangle of its inverse, pixels⁻²
-    whitening: Tensor  # [N, 3] p, q, r of W = [[p, q], [0, r]], WᵀW half the conic: at an offset d, α ∝ exp(−|W d|²)
-    compensations: Tensor  # [N] √(det Σ / det(Σ + ε I)), what ε adds to the ellipse's area; at least LEAST_KEPT
+    # [N, 3] p, q, r of W = [[p, q], [0, r]], WᵀW half the conic: at an offset d, α ∝ exp(−|W d|²)
+    whitening: Tensor
+    # [N] √(det Σ / det(Σ + ε I)), what ε adds to the ellipse's area; at least LEAST_KEPT
+    compensations: Tensor
     depths: Tensor  # [N] camera z
     radii: Tensor  # [N] int, extent of the opacity-independent ellipse of 3.33 σ in pixels
     visible: Tensor  # [N] bool
@@ -36,7 +39,9 @@ def is_antialiased(rasterize_mode: str) -> bool:
 
 
 def compensated(opacities: Tensor, compensations: Tensor) -> Tensor:
-    """Opacities [N] times compensations [N]; one that is not finite becomes 0, and gives neither a gradient."""
+    """Opacities [N] times compensations [N]; one that is not finite becomes 0, and gives neither a
+    gradient.
+    """
     return torch.where(torch.isfinite(opacities), opacities, 0) * compensations
 
 
@@ -52,17 +57,25 @@ def project(
 ) -> Projected:
     """Project Gaussians into one camera.
 
-    Args: see `rasterize`; `viewmat` [4, 4], `K` [3, 3]; size: width and height; bounds: near and far plane.
-    Choices: culled by `not (near < z < far)`, which rejects NaN too; the view ray's slope is clamped to 1.3 times the
-    field of view in the Jacobian, as gsplat does; a zero quaternion or a non-finite result is culled, never repaired.
+    Args: see `rasterize`; `viewmat` [4, 4], `K` [3, 3]; size: width and height; bounds: near and
+      far plane.
+    Choices: culled by `not (near < z < far)`, which rejects NaN too; the view ray's slope is
+      clamped to 1.3 times the
+    field of view in the Jacobian, as gsplat does; a zero quaternion or a non-finite result is
+    culled, never repaired.
     """
     (width, height), (near_plane, far_plane) = size, bounds
     camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     usable = (camera[:, 2] > near_plane) & (camera[:, 2] < far_plane)
-    usable &= torch.isfinite(camera).all(-1) & torch.isfinite(scales).all(-1) & torch.isfinite(quats).all(-1)
+    usable &= (
+        torch.isfinite(camera).all(-1)
+        & torch.isfinite(scales).all(-1)
+        & torch.isfinite(quats).all(-1)
+    )
     usable &= quats.abs().amax(-1) > 1e-12
 
-    # Compute on harmless stand-ins where unusable: a masked-out NaN would still poison the gradient.
+    # Compute on harmless stand-ins where unusable: a masked-out NaN would still poison the
+    # gradient.
     one = torch.tensor([0.0, 0.0, 1.0], dtype=means.dtype, device=means.device)
     camera = torch.where(usable[:, None], camera, one)
     quats = torch.where(usable[:, None], quats, torch.ones_like(quats))
@@ -75,7 +88,11 @@ def project(
     ty = z * torch.minimum(torch.maximum(y / z, -(cy / fy + slack_y)), (height - cy) / fy + slack_y)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
-        [torch.stack([fx / z, zero, -fx * tx / z**2], -1), torch.stack([zero, fy / z, -fy * ty / z**2], -1)], -2
+        [
+            torch.stack([fx / z, zero, -fx * tx / z**2], -1),
+            torch.stack([zero, fy / z, -fy * ty / z**2], -1),
+        ],
+        -2,
     )
     factor = jacobian @ viewmat[:3, :3] @ rotation_matrices(quats) * scales[:, None, :]  # [N, 2, 3]
     a, b, c, _, determinant = (t.detach() for t in _ellipses(factor, eps2d))
@@ -88,19 +105,30 @@ def project(
     # from the covariance, not from the conic, whose own determinant would cancel
     p, r = (0.5 * (c + eps2d) / determinant).sqrt(), (0.5 / (c + eps2d)).sqrt()
     whitening = torch.stack([p, -p * b / (c + eps2d), r], -1)
-    compensations = (torch.linalg.vector_norm(cross, dim=-1) / determinant.sqrt()).clamp_min(LEAST_KEPT)
+    compensations = (torch.linalg.vector_norm(cross, dim=-1) / determinant.sqrt()).clamp_min(
+        LEAST_KEPT
+    )
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
 
     reach = (EXTENT * largest.sqrt()).ceil().clamp_max(2**30)
     u, v = means2d.detach().unbind(-1)
-    visible = visible & (u + reach > 0) & (u - reach < width) & (v + reach > 0) & (v - reach < height)
-    rows = [torch.where(visible[:, None], t, torch.zeros_like(t)) for t in (means2d, covariances, conics, whitening)]
+    visible = (
+        visible & (u + reach > 0) & (u - reach < width) & (v + reach > 0) & (v - reach < height)
+    )
+    rows = [
+        torch.where(visible[:, None], t, torch.zeros_like(t))
+        for t in (means2d, covariances, conics, whitening)
+    ]
     numbers = [torch.where(visible, t, torch.zeros_like(t)) for t in (compensations, z, reach)]
-    return Projected(rows[0], rows[1], rows[2], rows[3], numbers[0], numbers[1], numbers[2].int(), visible)
+    return Projected(
+        rows[0], rows[1], rows[2], rows[3], numbers[0], numbers[1], numbers[2].int(), visible
+    )
 
 
 def _ellipses(factor: Tensor, eps2d: float) -> tuple[Tensor, ...]:
-    """F Fᵀ of F [N, 2, 3]: xx, xy, yy without ε, the cross product of F's rows [N, 3], and det(F Fᵀ + ε I)."""
+    """F Fᵀ of F [N, 2, 3]: xx, xy, yy without ε, the cross product of F's rows [N, 3], and det(F Fᵀ
+    + ε I).
+    """
     p1, p2 = factor.unbind(-2)
     a, b, c = (p1 * p1).sum(-1), (p1 * p2).sum(-1), (p2 * p2).sum(-1)
     # Cauchy-Binet: a sum of non-negative terms, where (a+ε)(c+ε) − b² cancels for needles.

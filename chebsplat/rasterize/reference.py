@@ -1,8 +1,10 @@
-"""The oracle: plain torch, any float type, tile by tile, each tile a few matrix products; and `lift`'s, in float64.
+"""The oracle: plain torch, any float type, tile by tile, each tile a few matrix products; and
+`lift`'s, in float64.
 
-Within a tile, at an offset (x, y) from its middle, ln α of a Gaussian is a quadratic in x and y: six coefficients. So
-one matrix product gives ln α of all its pixels and Gaussians, and a second one, of compositing weights and colours,
-the image. Tiles with about as many Gaussians go together, filled up with ones that nobody sees.
+Within a tile, at an offset (x, y) from its middle, ln α of a Gaussian is a quadratic in x and y:
+six coefficients. So one matrix product gives ln α of all its pixels and Gaussians, and a second
+one, of compositing weights and colours, the image. Tiles with about as many Gaussians go together,
+filled up with ones that nobody sees.
 """
 
 from __future__ import annotations
@@ -57,16 +59,18 @@ def rasterize(
       Ks:          [C, 3, 3] pixels.
       backgrounds: [C, D]; black if None.
       max_alpha:   ceiling of one Gaussian's alpha; its gradient above is zero.
-      rasterize_mode: `antialiased` multiplies opacities by √(det Σ / det(Σ + eps2d I)), Σ the projected covariance, so
-        that a Gaussian smaller than a pixel fades as it shrinks, to 0.005 at least; `classic` does not.
-      absgrad:     whether meta's `means2d` carries `absgrad` [C, N, 2], after backward the sum over pixels of the
-        absolute gradient.
-      cell_colors: [N, E] or [C, N, E], channels of which only means over cells of 4×4 pixels are wanted, on black; on
-        the cpu backend they take a sixteenth of the products of `colors`.
-    Returns: renders [C, H, W, D], alphas [C, H, W, 1], and meta: `means2d` [C, N, 2] (retains its gradient),
-      `conics` [C, N, 3], `depths` [C, N], `radii` [C, N] and, given cell_colors, `cells` [C, ⌈H/4⌉, ⌈W/4⌉, E], each
-      the mean over those of its pixels that lie in the image.
-    Raises: ValueError on an unknown mode or, in backward, on a gradient of the image that is not finite.
+      rasterize_mode: `antialiased` multiplies opacities by √(det Σ / det(Σ + eps2d I)), Σ the
+        projected covariance, so that a Gaussian smaller than a pixel fades as it shrinks, to 0.005
+        at least; `classic` does not.
+      absgrad:     whether meta's `means2d` carries `absgrad` [C, N, 2], after backward the sum over
+        pixels of the absolute gradient.
+      cell_colors: [N, E] or [C, N, E], channels of which only means over cells of 4×4 pixels are
+        wanted, on black; on the cpu backend they take a sixteenth of the products of `colors`.
+    Returns: renders [C, H, W, D], alphas [C, H, W, 1], and meta: `means2d` [C, N, 2] (retains its
+      gradient), `conics` [C, N, 3], `depths` [C, N], `radii` [C, N] and, given cell_colors, `cells`
+      [C, ⌈H/4⌉, ⌈W/4⌉, E], each the mean over those of its pixels that lie in the image.
+    Raises: ValueError on an unknown mode or, in backward, on a gradient of the image that is not
+      finite.
     Choices: gsplat's constants, so that every backend renders a scene alike.
     """
     antialiased = is_antialiased(rasterize_mode)
@@ -84,7 +88,9 @@ def rasterize(
         strengths = compensated(opacities, view.compensations) if antialiased else opacities
         channels = colors if colors.ndim == 2 else colors[c]
         sums = None if absolute is None else absolute[c]
-        render, alpha = _composite(means2d[c], view, strengths, channels, width, height, max_alpha, sums)
+        render, alpha = _composite(
+            means2d[c], view, strengths, channels, width, height, max_alpha, sums
+        )
         if render.requires_grad:
             render.register_hook(partial(_refuse_broken, c))
         renders.append(render)
@@ -103,7 +109,9 @@ def rasterize(
 
 
 def with_cells(colors: Tensor, cell_colors: Tensor | None) -> Tensor:
-    """Both kinds of channels side by side, [N, D + E], or [C, N, D + E] if either is given by view."""
+    """Both kinds of channels side by side, [N, D + E], or [C, N, D + E] if either is given by
+    view.
+    """
     if cell_colors is None:
         return colors
     shape = torch.broadcast_shapes(colors.shape[:-1], cell_colors.shape[:-1])
@@ -111,8 +119,12 @@ def with_cells(colors: Tensor, cell_colors: Tensor | None) -> Tensor:
 
 
 def cell_means(images: Tensor) -> Tensor:
-    """Means [C, ⌈H/4⌉, ⌈W/4⌉, E] of images [C, H, W, E] over cells of 4×4 pixels, cut off by the image's edge."""
-    means = torch.nn.functional.avg_pool2d(images.permute(0, 3, 1, 2), CELL, ceil_mode=True, count_include_pad=False)
+    """Means [C, ⌈H/4⌉, ⌈W/4⌉, E] of images [C, H, W, E] over cells of 4×4 pixels, cut off by the
+    image's edge.
+    """
+    means = torch.nn.functional.avg_pool2d(
+        images.permute(0, 3, 1, 2), CELL, ceil_mode=True, count_include_pad=False
+    )
     return means.permute(0, 2, 3, 1)
 
 
@@ -125,19 +137,31 @@ def _composite(
     means2d: Tensor, view: Projected, opacities: Tensor, channels: Tensor, width: int, height: int, max_alpha: float,
     absolute: Tensor | None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Render [H, W, D] and alpha [H, W, 1] of one view; backward also adds to `absolute` [N, 2] if given, in place."""
-    shown = view.visible & (opacities >= ALPHA_MIN) & torch.isfinite(opacities) & torch.isfinite(channels).all(-1)
+    """Render [H, W, D] and alpha [H, W, 1] of one view; backward also adds to `absolute` [N, 2] if
+    given, in place.
+    """
+    shown = (
+        view.visible
+        & (opacities >= ALPHA_MIN)
+        & torch.isfinite(opacities)
+        & torch.isfinite(channels).all(-1)
+    )
     index = shown.nonzero()[:, 0]
     index = index[torch.argsort(view.depths[index], stable=True)]
     columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
     table = torch.cat([means2d, view.whitening, opacities[:, None], channels], 1)[index]
-    owner, tile = _pairs(table[:, :6].detach(), view.covariances[index].detach(), columns, rows, width, height, TILE)
+    owner, tile = _pairs(
+        table[:, :6].detach(), view.covariances[index].detach(), columns, rows, width, height, TILE
+    )
     pairs = table.index_select(0, owner)
     middles = torch.stack([tile % columns, tile // columns], -1) * TILE + TILE / 2
     offsets, whitening = pairs[:, :2] - middles, pairs[:, 2:5]
     quadratics = _quadratics(offsets, whitening, pairs[:, 5].log())
     filler = quadratics.new_tensor([[UNSEEN, 0, 0, 0, 0, 0]])
-    quadratics, colors = torch.cat([quadratics, filler]), torch.cat([pairs[:, 6:], torch.zeros_like(channels[:1])])
+    quadratics, colors = (
+        torch.cat([quadratics, filler]),
+        torch.cat([pairs[:, 6:], torch.zeros_like(channels[:1])]),
+    )
     counts = torch.bincount(tile, minlength=columns * rows)
     starts = counts.cumsum(0) - counts
     by_count = torch.argsort(counts)
@@ -148,7 +172,8 @@ def _composite(
     for tiles in _batches(by_count, counts):
         most = int(counts[tiles[-1]])
         slots = torch.arange(most, device=tiles.device)
-        members = torch.where(slots < counts[tiles, None], starts[tiles, None] + slots, len(tile))  # [T, most]
+        # [T, most]
+        members = torch.where(slots < counts[tiles, None], starts[tiles, None] + slots, len(tile))
         log_alphas = basis @ quadratics[members].mT
         if absolute is not None and log_alphas.requires_grad:
             real = members < len(tile)
@@ -163,8 +188,12 @@ def _composite(
     return image[..., :-1], image[..., -1:]
 
 
-def _add_absolute(absolute: Tensor, shapes: Tensor, who: Tensor, x: Tensor, y: Tensor, gradient: Tensor) -> None:
-    """Add Σ |∂L/∂mean| over pixels; gradient [T, TILE², M] to ln α, shapes [T, M, 5] of Gaussians who [T, M] or −1."""
+def _add_absolute(
+    absolute: Tensor, shapes: Tensor, who: Tensor, x: Tensor, y: Tensor, gradient: Tensor
+) -> None:
+    """Add Σ |∂L/∂mean| over pixels; gradient [T, TILE², M] to ln α, shapes [T, M, 5] of Gaussians
+    who [T, M] or −1.
+    """
     mean_x, mean_y, p, q, r = (t[:, None] for t in shapes.unbind(-1))
     dx, dy = x[:, None] - mean_x, y[:, None] - mean_y
     u = p * dx + q * dy
@@ -176,22 +205,36 @@ def _add_absolute(absolute: Tensor, shapes: Tensor, who: Tensor, x: Tensor, y: T
 def _pairs(
     table: Tensor, covariances: Tensor, columns: int, rows: int, width: int, height: int, side: int
 ) -> tuple[Tensor, Tensor]:
-    """Which of M Gaussians may reach 1/255 in which tile: indices [P] of both, tile by tile and in order within.
+    """Which of M Gaussians may reach 1/255 in which tile: indices [P] of both, tile by tile and in
+    order within.
 
     Args: table [M, 6] means, whitening and opacities; covariances [M, 3].
     """
     u, v, p, q, r, opacities = table.unbind(-1)
     limit = (255 * opacities).log().clamp_min(0) + 1e-3  # a little more than enough
-    reach_x, reach_y = (2 * limit * covariances[:, 0]).sqrt(), (2 * limit * covariances[:, 2]).sqrt()
-    first_x, last_x = (((u + sign * reach_x).clamp(0, width - 1) // side).long() for sign in (-1, 1))
-    first_y, last_y = (((v + sign * reach_y).clamp(0, height - 1) // side).long() for sign in (-1, 1))
+    reach_x, reach_y = (
+        (2 * limit * covariances[:, 0]).sqrt(),
+        (2 * limit * covariances[:, 2]).sqrt(),
+    )
+    first_x, last_x = (
+        ((u + sign * reach_x).clamp(0, width - 1) // side).long() for sign in (-1, 1)
+    )
+    first_y, last_y = (
+        ((v + sign * reach_y).clamp(0, height - 1) // side).long() for sign in (-1, 1)
+    )
     across = last_x - first_x + 1
     counts = across * (last_y - first_y + 1)
     owner = torch.repeat_interleave(torch.arange(len(counts), device=u.device), counts)
     nth = torch.arange(len(owner), device=u.device) - (counts.cumsum(0) - counts)[owner]
     x, y = first_x[owner] + nth % across[owner], first_y[owner] + nth // across[owner]
     # the ellipse against the parallelogram that a tile is in whitened coordinates
-    dx, dy, p, q, r = x * side + side / 2 - u[owner], y * side + side / 2 - v[owner], p[owner], q[owner], r[owner]
+    dx, dy, p, q, r = (
+        x * side + side / 2 - u[owner],
+        y * side + side / 2 - v[owner],
+        p[owner],
+        q[owner],
+        r[owner],
+    )
     far_u = ((p * dx + q * dy).abs() - side / 2 * (p + q.abs())).clamp_min(0)
     far_v = ((r * dy).abs() - side / 2 * r).clamp_min(0)
     near = far_u * far_u + far_v * far_v <= limit[owner]
@@ -201,11 +244,21 @@ def _pairs(
 
 
 def _quadratics(offsets: Tensor, whitening: Tensor, log_opacities: Tensor) -> Tensor:
-    """Coefficients [P, 6] of ln α to 1, x, y, x², xy, y²; offsets [P, 2] of the means from the middle of a tile."""
+    """Coefficients [P, 6] of ln α to 1, x, y, x², xy, y²; offsets [P, 2] of the means from the
+    middle of a tile.
+    """
     p, q, r = whitening.unbind(-1)
     u, v = -(p * offsets[:, 0] + q * offsets[:, 1]), -r * offsets[:, 1]
     return -torch.stack(
-        [u * u + v * v - log_opacities, 2 * u * p, 2 * (u * q + v * r), p * p, 2 * p * q, q * q + r * r], -1
+        [
+            u * u + v * v - log_opacities,
+            2 * u * p,
+            2 * (u * q + v * r),
+            p * p,
+            2 * p * q,
+            q * q + r * r,
+        ],
+        -1,
     )
 
 
@@ -220,10 +273,11 @@ def _batches(by_count: Tensor, counts: Tensor) -> list[Tensor]:
 
 
 class _Weights(torch.autograd.Function):
-    """Compositing weights α_i Π_{j<i} (1 − α_j) of depth-sorted Gaussians, the last dimension, of ln α.
+    """Compositing weights α_i Π_{j<i} (1 − α_j) of depth-sorted Gaussians, the last dimension, of
+    ln α.
 
-    Its adjoint is α_i T_i ∂w_i − α_i / (1 − α_i) Σ_{j>i} w_j ∂w_j: half the passes that autograd would make. Tests hold
-    it to autograd.
+    Its adjoint is α_i T_i ∂w_i − α_i / (1 − α_i) Σ_{j>i} w_j ∂w_j: half the passes that autograd
+    would make. Tests hold it to autograd.
     """
 
     @staticmethod
@@ -232,7 +286,8 @@ class _Weights(torch.autograd.Function):
         after = torch.cumprod(1 - alphas, -1)
         weights = alphas.clone()
         weights[..., 1:] *= after[..., :-1]
-        weights *= hardshrink(after, T_MIN).sign_()  # a mask of numbers: torch vectorises no mask of truths
+        # a mask of numbers: torch vectorises no mask of truths
+        weights *= hardshrink(after, T_MIN).sign_()
         ctx.save_for_backward(alphas, weights)
         ctx.max_alpha = max_alpha
         return weights
@@ -259,14 +314,20 @@ def pixel_weights(
     size: tuple[int, int],
     max_alpha: float = 0.99,
 ) -> np.ndarray:
-    """Weights w = α T of every Gaussian at every pixel, f64 [H, W, N]; arguments as of `lift.lift`."""
-    means, quats, scales, opacities = (torch.from_numpy(np.asarray(a, np.float64)) for a in gaussians)
+    """Weights w = α T of every Gaussian at every pixel, f64 [H, W, N]; arguments as of
+    `lift.lift`.
+    """
+    means, quats, scales, opacities = (
+        torch.from_numpy(np.asarray(a, np.float64)) for a in gaussians
+    )
     width, height = size
     pose, intrinsics = (torch.from_numpy(np.asarray(matrix, np.float64)) for matrix in (viewmat, K))
     view = project(means, quats, scales, pose, intrinsics, (width, height), (0.01, 1e10), 0.3)
     order = torch.argsort(view.depths, stable=True).numpy()
     whitening, centers = view.whitening.numpy(), view.means2d.numpy()
-    opacity = np.where(view.visible.numpy() & (opacities.numpy() >= ALPHA_MIN), opacities.numpy(), 0.0)
+    opacity = np.where(
+        view.visible.numpy() & (opacities.numpy() >= ALPHA_MIN), opacities.numpy(), 0.0
+    )
     y, x = np.indices((height, width)) + 0.5
     weights, transmittance = np.zeros((height, width, len(means))), np.ones((height, width))
     is_open = np.ones((height, width), bool)

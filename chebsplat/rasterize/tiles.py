@@ -1,12 +1,13 @@
 """Compositing, tile by tile, for one view and float32; its adjoint is `tiles_adjoint`.
 
-A tile of 16×16 pixels is 16 cells of 4×4 (see `cells`). Forward tests a tile's Gaussians against all its cells at
-once, in chunks until every pixel is done, then sweeps cell by cell. Backward repeats the sweep, so that only the
-cells' bit masks are kept between the two.
+A tile of 16×16 pixels is 16 cells of 4×4 (see `cells`). Forward tests a tile's Gaussians against
+all its cells at once, in chunks until every pixel is done, then sweeps cell by cell. Backward
+repeats the sweep, so that only the cells' bit masks are kept between the two.
 
-Channels come in two kinds: `colors` by pixel, and `cell_colors`, of which only the mean over each cell of 4×4 pixels is
-rendered. A Gaussian's part in that mean is the sum of its 16 weights, so a cell channel costs a sixteenth of the
-products of the other kind, forward and backward.
+Channels come in two kinds: `colors` by pixel, and `cell_colors`, of which only the mean over each
+  cell of 4×4 pixels is
+rendered. A Gaussian's part in that mean is the sum of its 16 weights, so a cell channel costs a
+sixteenth of the products of the other kind, forward and backward.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ CHUNK = 128  # Gaussians of a tile between two looks at whether it is done
 
 @inline
 def cell_column(channels):
-    """Where the cell channels of a splat begin: behind its shape, its channels and the 1 for alpha."""
+    """Where the cell channels of a splat begin: behind its shape, its channels and the 1 for
+    alpha.
+    """
     return cells.whole(SHAPE + channels + 1)
 
 
@@ -35,8 +38,8 @@ def cell_column(channels):
 def pack(order, means2d, whitening, opacities, colors, cell_colors):
     """What the tiles read of each Gaussian, in rows of whole cache lines, front to back.
 
-    Returns: splats [V + 1, S]: mean, whitening, log₂ opacity, two unused, the channels, a 1 for alpha, zeros, and from
-      `cell_column` on the cell channels and zeros.
+    Returns: splats [V + 1, S]: mean, whitening, log₂ opacity, two unused, the channels, a 1 for
+      alpha, zeros, and from `cell_column` on the cell channels and zeros.
     """
     channels, column = colors.shape[1], cell_column(colors.shape[1])
     splats = np.zeros((len(order) + 1, column + cells.whole(cell_colors.shape[1])), np.float32)
@@ -55,7 +58,9 @@ def pack(order, means2d, whitening, opacities, colors, cell_colors):
 
 @serial
 def fill_shapes(splats, ranks, start, n, left, top, shapes):
-    """Fill the tile's rows of shapes (see `cells`), and up to SLACK more, with the channels that they have room for."""
+    """Fill the tile's rows of shapes (see `cells`), and up to SLACK more, with the channels that
+    they have room for.
+    """
     stop, step, depth = len(ranks) - 1, splats.shape[1], shapes.shape[1] - SHAPE
     for k in range(n):
         following = np.int64(ranks[min(start + k + AHEAD_OF_CACHE, stop)]) * step
@@ -63,10 +68,15 @@ def fill_shapes(splats, ranks, start, n, left, top, shapes):
             prefetch(splats, following + d)
         m = ranks[start + k]
         p, q, r = splats[m, 2], splats[m, 3], splats[m, 4]
-        dx, dy = np.float32(left + TILE // 2) - splats[m, 0], np.float32(top + TILE // 2) - splats[m, 1]
+        dx, dy = (
+            np.float32(left + TILE // 2) - splats[m, 0],
+            np.float32(top + TILE // 2) - splats[m, 1],
+        )
         shapes[k, 0], shapes[k, 1], shapes[k, 2] = p, q, r
         shapes[k, 3], shapes[k, 4], shapes[k, 5] = p * dx + q * dy, r * dy, splats[m, 5]
-        cells.copy_whole(splats, np.int64(m) * step + SHAPE, depth, shapes, k * shapes.shape[1] + SHAPE)
+        cells.copy_whole(
+            splats, np.int64(m) * step + SHAPE, depth, shapes, k * shapes.shape[1] + SHAPE
+        )
 
 
 @serial
@@ -80,11 +90,16 @@ def n_pixels_inside(cell, width, height):
 def _forward_tile(
     splats, ranks, start, stop, left, top, width, height, channels, max_alpha, masks, render, means, transmittance
 ):  # fmt: skip
-    """One tile of `forward`, into flat render and transmittance. Returns how many of its pairs were looked at."""
+    """One tile of `forward`, into flat render and transmittance. Returns how many of its pairs were
+    looked at.
+    """
     states, depth = np.empty((LANES, 2, LANES), np.float32), cells.padded(channels)
     cells.begin(states, width - left, height - top)
     sums, column = np.zeros((LANES, depth, LANES), np.float32), cell_column(channels)
-    mean_sums, shares = np.zeros((LANES, splats.shape[1] - column), np.float32), np.empty(CHUNK, np.float32)
+    mean_sums, shares = (
+        np.zeros((LANES, splats.shape[1] - column), np.float32),
+        np.empty(CHUNK, np.float32),
+    )
     shapes = np.empty((CHUNK + SLACK, SHAPE + depth), np.float32)
     alphas, weights = np.empty((CHUNK, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
     hits, rows = np.empty(CHUNK + LANES, np.uint32), np.empty(CHUNK, np.uint32)
@@ -103,7 +118,9 @@ def _forward_tile(
                 cells.accumulate(shapes, rows, weights, count, cell, sums)
                 if means.shape[2] > 0:
                     cells.sum_lanes(weights, count, shares)
-                    cells.accumulate_means(splats, column, ranks, first, rows, shares, count, cell, mean_sums)
+                    cells.accumulate_means(
+                        splats, column, ranks, first, rows, shares, count, cell, mean_sums
+                    )
             done[cell] = cells.is_done(states, cell)
             n_done += done[cell]
         first += n
@@ -114,11 +131,14 @@ def _forward_tile(
         n = min(4, width - x)
         if n <= 0 or y >= height:
             continue
-        for c in range(depth - 4, -1, -4):  # what the last four spill into the next pixel, the first four mend
+        # what the last four spill into the next pixel, the first four mend
+        for c in range(depth - 4, -1, -4):
             from_lanes(pixels, c, channels, sums, LANES * (cell * depth + c))
         for row in range(min(4, height - y)):
             cells.copy(states, 2 * LANES * cell + 4 * row, n, transmittance, (y + row) * width + x)
-            cells.copy(pixels, 4 * row * channels, n * channels, render, ((y + row) * width + x) * channels)
+            cells.copy(
+                pixels, 4 * row * channels, n * channels, render, ((y + row) * width + x) * channels
+            )
     for cell in range(LANES):
         n_inside = n_pixels_inside(cell, width - left, height - top)
         if n_inside > 0:
@@ -132,9 +152,9 @@ def _forward_tile(
 def forward(splats, tile_starts, ranks, channels, cell_channels, width, height, max_alpha):
     """Composite front to back the splats of `pack`, listed by `binning.bin_gaussians`.
 
-    Returns: render [H, W, D], means [⌈H/4⌉, ⌈W/4⌉, E] over the cells, transmittance [H, W]; masks u16 [P + 16] of
-      the cells each pair may reach, and used [tiles], the pairs that were looked at before all pixels were done: for
-      `backward`.
+    Returns: render [H, W, D], means [⌈H/4⌉, ⌈W/4⌉, E] over the cells, transmittance [H, W]; masks
+      u16 [P + 16] of the cells each pair may reach, and used [tiles], the pairs that were looked at
+      before all pixels were done: for `backward`.
     """
     columns, n_tiles = (width + TILE - 1) // TILE, len(tile_starts) - 1
     render = np.empty(height * width * channels, np.float32)

@@ -1,5 +1,6 @@
-"""The adjoint of compositing, tile by tile (see `tiles`): a tile fills the records of its pairs, and every Gaussian's
-records are summed in the order of its pairs, so that gradients are the same bits for any number of threads.
+"""The adjoint of compositing, tile by tile (see `tiles`): a tile fills the records of its pairs,
+and every Gaussian's records are summed in the order of its pairs, so that gradients are the same
+bits for any number of threads.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ def _backward_tile(
     splats, ranks, pair, masks, start, n, left, top, width, height, channels, max_alpha, grad, grad_means, grad_alpha,
     absolute, base, spare, records,
 ):  # fmt: skip
-    """One tile of `backward`: adds to the records of its pairs. Returns whether the gradient is finite.
+    """One tile of `backward`: adds to the records of its pairs. Returns whether the gradient is
+    finite.
 
     `base` is the first pair's number, `spare` a row of records that takes what fills up a block.
     """
@@ -34,14 +36,21 @@ def _backward_tile(
     mean_grads = np.zeros((LANES, splats.shape[1] - column), np.float32)
     for cell in range(LANES):
         x, y = cells.corner(cell)
-        x, y, at, in_lanes = left + x, top + y, cell * row, LANES * (grads.shape[1] * cell + channels)
+        x, y, at, in_lanes = (
+            left + x,
+            top + y,
+            cell * row,
+            LANES * (grads.shape[1] * cell + channels),
+        )
         n_wide = max(min(4, width - x), 0)
         for k in range(4):
             inside = n_wide if y + k < height else 0
             cells.copy(grad, ((y + k) * width + x) * channels, inside * channels, tall_grads, at)
             at += 4 * channels
         for c in range(0, channels, 4):
-            to_lanes(grads, LANES * (grads.shape[1] * cell + c), tall_grads, cell * row + c, channels)
+            to_lanes(
+                grads, LANES * (grads.shape[1] * cell + c), tall_grads, cell * row + c, channels
+            )
         for k in range(4):  # after `to_lanes`, whose last four channels may reach into this one
             inside = n_wide if y + k < height else 0
             cells.copy(grad_alpha, (y + k) * width + x, inside, grads, in_lanes + 4 * k)
@@ -58,7 +67,11 @@ def _backward_tile(
     room = (n + BLOCK) // BLOCK * BLOCK
     shapes = np.empty((n + SLACK, SHAPE + cells.padded(depth)), np.float32)
     alphas, weights = np.empty((room, LANES), np.float32), np.empty((room, LANES), np.float32)
-    g, slots, shares = np.empty((room, LANES), np.float32), np.empty(room, np.int64), np.empty(n, np.float32)
+    g, slots, shares = (
+        np.empty((room, LANES), np.float32),
+        np.empty(room, np.int64),
+        np.empty(n, np.float32),
+    )
     hits, rows = np.empty(n + LANES, np.uint32), np.empty(room, np.uint32)
     fill_shapes(splats, ranks, start, n, left, top, shapes)
     for cell in range(LANES):
@@ -72,7 +85,9 @@ def _backward_tile(
             slots[m], rows[m] = spare, 0
         cell_adjoint.slopes(shapes, rows, grads, count, cell, depth, g)
         if grad_means.shape[2] > 0:
-            cell_adjoint.add_slopes_of_means(splats, column, ranks, start, rows, count, cell, mean_grads, g)
+            cell_adjoint.add_slopes_of_means(
+                splats, column, ranks, start, rows, count, cell, mean_grads, g
+            )
             cells.sum_lanes(weights, count, shares)
             cell_adjoint.record_means(
                 shares, mean_grads, count, cell, slots, N_GEOMETRY + cells.padded(channels), records
@@ -92,13 +107,14 @@ def backward(
     n, splats, order, tile_starts, ranks, pair, pair_starts, masks, used, max_alpha, grad, grad_means, grad_alpha,
     absolute,
 ):  # fmt: skip
-    """Gradients of n Gaussians, band by band, each Gaussian's records summed in the order of its pairs.
+    """Gradients of n Gaussians, band by band, each Gaussian's records summed in the order of its
+    pairs.
 
-    Args: masks, used as `forward` returned them; grad [H, W, D] of the render, grad_means [⌈H/4⌉, ⌈W/4⌉, E],
-      grad_alpha [H, W]; absolute: whether to gather the absolute gradient too.
-    Returns: gradients to means2d [n, 2]; moments [n, 3] for `ellipses.project_adjoint`; gradients to opacities [n],
-      the absolute gradient to means2d [n or 0, 2], to colors [n, D], to cell_colors [n, E]; whether the image's
-      gradient is finite.
+    Args: masks, used as `forward` returned them; grad [H, W, D] of the render, grad_means [⌈H/4⌉,
+      ⌈W/4⌉, E], grad_alpha [H, W]; absolute: whether to gather the absolute gradient too.
+    Returns: gradients to means2d [n, 2]; moments [n, 3] for `ellipses.project_adjoint`; gradients
+      to opacities [n], the absolute gradient to means2d [n or 0, 2], to colors [n, D], to
+      cell_colors [n, E]; whether the image's gradient is finite.
     """
     height, width, channels = grad.shape
     flat, flat_alpha = grad.reshape(-1), grad_alpha.reshape(-1)
@@ -139,7 +155,10 @@ def backward(
                     to_colors[order[m], d] += records[k, N_GEOMETRY + d]
                 cell_adjoint.add_means(records, k, column, to_cell_colors, order[m])
     to_means2d, moments = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
-    to_opacities, to_absolute = np.zeros(n, np.float32), np.zeros((n if absolute else 0, 2), np.float32)
+    to_opacities, to_absolute = (
+        np.zeros(n, np.float32),
+        np.zeros((n if absolute else 0, 2), np.float32),
+    )
     for m in prange(shown):
         i, p, q, r = order[m], splats[m, 2], splats[m, 3], splats[m, 4]
         to_means2d[i, 0] = 2 * p * sums[m, 1]
@@ -148,4 +167,12 @@ def backward(
         to_opacities[i] = sums[m, 0] * 2.0 ** (-splats[m, 5]) / math.log(2.0)
         if absolute:
             to_absolute[i, 0], to_absolute[i, 1] = sums[m, 6], sums[m, 7]
-    return to_means2d, moments, to_opacities, to_absolute, to_colors, to_cell_colors[:, :cell_channels], finite.all()
+    return (
+        to_means2d,
+        moments,
+        to_opacities,
+        to_absolute,
+        to_colors,
+        to_cell_colors[:, :cell_channels],
+        finite.all(),
+    )

@@ -21,20 +21,26 @@ def canonicalize(means: Tensor, scales: Tensor, rotmats: Tensor, mask: Tensor) -
     """Remove a region's position and size, in float64, so that no parameter below carries units.
 
     Args:
-      means:   [M, n, 3] scene units; subtract the scene's origin in float64 before any cast to float32.
+      means:   [M, n, 3] scene units; subtract the scene's origin in float64 before any cast to
+        float32.
       scales:  [M, n, 3] standard deviations, scene units, >= 0.
       rotmats: [M, n, 3, 3].
       mask:    [M, n] false for padding.
     Returns: the region; rows with a non-finite value join the padding and are zeroed.
     """
-    finite = torch.isfinite(means).all(-1) & torch.isfinite(scales).all(-1) & torch.isfinite(rotmats).all((-1, -2))
+    finite = (
+        torch.isfinite(means).all(-1)
+        & torch.isfinite(scales).all(-1)
+        & torch.isfinite(rotmats).all((-1, -2))
+    )
     mask = mask & finite
     keep = mask[..., None]
     means = torch.where(keep, means.double(), 0.0)
     first = mask.to(torch.int8).argmax(1)
     means = means - means.gather(1, first[:, None, None].expand(-1, 1, 3))
     count = mask.sum(1).clamp_min(1)[:, None, None]
-    # Two steps keep every digit of a region far from the origin; dividing by the extent first keeps 1e±150 in range.
+    # Two steps keep every digit of a region far from the origin; dividing by the extent first keeps
+    # 1e±150 in range.
     extent = torch.where(keep, means, 0.0).abs().amax((1, 2), keepdim=True)
     extent = torch.where(extent > 0, extent, 1.0)
     means = torch.where(keep, means / extent, 0.0)
@@ -47,16 +53,24 @@ def canonicalize(means: Tensor, scales: Tensor, rotmats: Tensor, mask: Tensor) -
 
 
 def metric_factors(region: Region, anisotropy: float) -> Tensor:
-    """Y_i = diag(sqrt(m_i)) R_iᵀ with m_ik = 1 / (1 + a (s_ik / s̃)²) (Eq 1); |Y_i Δ|² is the squared length of Δ.
+    """Y_i = diag(sqrt(m_i)) R_iᵀ with m_ik = 1 / (1 + a (s_ik / s̃)²) (Eq 1); |Y_i Δ|² is the
+    squared length of Δ.
 
     Returns: [M, n, 3, 3].
-    Choices: s̃ is the region's median largest scale, so that anisotropy does not fade with the scene's units; a region
+    Choices: s̃ is the region's median largest scale, so that anisotropy does not fade with the
+      scene's units; a region
     whose s̃ is 0 is isotropic wherever its scales are 0.
     """
     largest = region.scales.amax(-1)
-    typical = torch.where(region.mask, largest, torch.nan).nanmedian(1).values.nan_to_num(0.0)[:, None, None]
+    typical = (
+        torch.where(region.mask, largest, torch.nan)
+        .nanmedian(1)
+        .values.nan_to_num(0.0)[:, None, None]
+    )
     ratio = torch.where(
-        typical > 0, region.scales / torch.where(typical > 0, typical, 1.0), 1e150 * region.scales.sign()
+        typical > 0,
+        region.scales / torch.where(typical > 0, typical, 1.0),
+        1e150 * region.scales.sign(),
     )
     root = 1 / torch.hypot(torch.ones_like(ratio), anisotropy**0.5 * ratio)
     return root[..., None] * region.rotmats.transpose(-1, -2)
@@ -66,15 +80,20 @@ def metric_factors(region: Region, anisotropy: float) -> Tensor:
 def tangent_axis(region: Region) -> tuple[Tensor, Tensor]:
     """The axis of least variance of the region's Gaussian mixture, and how well it is defined.
 
-    Returns: axis [M, 3], of arbitrary sign; certainty [M], a smoothstep of the gap of the two smallest variances.
+    Returns: axis [M, 3], of arbitrary sign; certainty [M], a smoothstep of the gap of the two
+      smallest variances.
       Neither has a gradient: that of an eigenvector does not exist where eigenvalues meet.
     """
     widest = region.scales.amax((1, 2), keepdim=True).clamp_min(1.0)
     spread = region.rotmats * (region.scales / widest)[..., None, :]
     centers = region.means / widest
     keep = region.mask[..., None, None]
-    mixture = torch.where(keep, spread @ spread.transpose(-1, -2) + centers[..., :, None] * centers[..., None, :], 0.0)
-    values, vectors = torch.linalg.eigh(mixture.sum(1) / region.mask.sum(1).clamp_min(1)[:, None, None])
+    mixture = torch.where(
+        keep, spread @ spread.transpose(-1, -2) + centers[..., :, None] * centers[..., None, :], 0.0
+    )
+    values, vectors = torch.linalg.eigh(
+        mixture.sum(1) / region.mask.sum(1).clamp_min(1)[:, None, None]
+    )
     low, middle, high = values.clamp_min(0).unbind(-1)
     total = low + middle + 1e-5 * high
     gap = torch.where(total > 0, (middle - low) / torch.where(total > 0, total, 1.0), 0.0)
@@ -96,14 +115,17 @@ def rotations_about(axis: Tensor, n_angles: int) -> Tensor:
 
 
 def similarity(region: Region, factors: Tensor, rotmats: Tensor, bandwidth: float) -> Tensor:
-    """S = A^-1/2 W A^-1/2, so that I − S is similar to the random-walk Laplacian of Eq 3: same spectrum, symmetric.
+    """S = A^-1/2 W A^-1/2, so that I − S is similar to the random-walk Laplacian of Eq 3: same
+    spectrum, symmetric.
 
     Args:
       factors: [M, n, 3, 3], from `metric_factors`.
       rotmats: [M, 3, 3], the rotation of every metric of a region.
     Returns: [M, n, n], zero diagonal, zero rows for padding.
-    Choices: degrees by logsumexp and one exponential of a difference of logarithms: a region all of whose weights
-    underflow still has the right operator. Differences are formed directly, never by the expanded square.
+    Choices: degrees by logsumexp and one exponential of a difference of logarithms: a region all of
+      whose weights
+    underflow still has the right operator. Differences are formed directly, never by the expanded
+    square.
     """
     delta = region.means[:, :, None] - region.means[:, None]
     turned = torch.einsum("mpqk,mkl->mpql", delta, rotmats)  # (rotmatᵀ Δ) in rows
@@ -114,7 +136,8 @@ def similarity(region: Region, factors: Tensor, rotmats: Tensor, bandwidth: floa
     log_weights = torch.where(pair, log_weights, 0.0)
     top = torch.where(pair, log_weights, -torch.inf).amax(-1).detach()
     top = torch.where(torch.isfinite(top), top, 0.0)
-    # Not by clamp_max: from torch 2.14 on it has no gradient at the bound, where each row's top lies.
+    # Not by clamp_max: from torch 2.14 on it has no gradient at the bound, where each row's top
+    # lies.
     degrees = torch.where(pair, log_weights - top[..., None], -torch.inf).exp().sum(-1)
     log_degrees = top + torch.where(degrees > 0, degrees, 1.0).log()
     exponent = log_weights - 0.5 * (log_degrees[:, :, None] + log_degrees[:, None])

@@ -1,10 +1,12 @@
-"""The symmetric operator u uᵀ − S of a region in float32 (Eqs 2-3): the fast twin of `albo.similarity`.
+"""The symmetric operator u uᵀ − S of a region in float32 (Eqs 2-3): the fast twin of
+`albo.similarity`.
 
-S u = u for u_i = sqrt(A_i / Σ A). Without that pair the spectrum of a well connected region keeps off ±1, where T_d
-multiplies rounding errors by d² rather than by d.
+S u = u for u_i = sqrt(A_i / Σ A). Without that pair the spectrum of a well connected region keeps
+off ±1, where T_d multiplies rounding errors by d² rather than by d.
 
-Matrices are [n, n] stored flat, where n is the member count filled up to a multiple of 16. All are symmetric: what
-fills one fills the blocks on and above the diagonal and mirrors them. Sums are carried out as written: no function here
+Matrices are [n, n] stored flat, where n is the member count filled up to a multiple of 16. All are
+symmetric: what fills one fills the blocks on and above the diagonal and mirrors them. Sums are
+  carried out as written: no function here
 may be compiled with reassociation.
 """
 
@@ -17,8 +19,8 @@ import numpy as np
 from chebsplat.kernels.jit import serial
 from chebsplat.kernels.simd import exp2, fma, load, splat, spread, store, transpose
 
-# Below this degree or bandwidth exponents are large enough for float32 to lose digits: the operator is then built in
-# float64 and in logarithms.
+# Below this degree or bandwidth exponents are large enough for float32 to lose digits: the operator
+# is then built in float64 and in logarithms.
 LEAST_DEGREE, LEAST_BANDWIDTH = np.float32(1e-3), 0.05
 ZERO = np.float32(0)
 
@@ -35,7 +37,8 @@ def mirror(a, n):
 def weights(points, factors, count, n, scale, out):
     """w_ij = 2^(scale (|Y_i Δ|² + |Y_j Δ|²)) into out [n, n], 0 on the diagonal and where padded.
 
-    Args: points [6, n], coordinates in two float32 each, so that differences keep every digit; factors [9, n].
+    Args: points [6, n], coordinates in two float32 each, so that differences keep every digit;
+      factors [9, n].
     """
     factor = splat(scale)
     for j in range(0, n, 16):
@@ -52,7 +55,11 @@ def weights(points, factors, count, n, scale, out):
             a, b, c = fma(m1, y, a), fma(m4, y, b), fma(m7, y, c)
             a, b, c = fma(m2, z, a), fma(m5, z, b), fma(m8, z, c)
             of_j = fma(a, a, fma(b, b, c * c))
-            a, b, c = spread(factors, i) * x, spread(factors, 3 * n + i) * x, spread(factors, 6 * n + i) * x
+            a, b, c = (
+                spread(factors, i) * x,
+                spread(factors, 3 * n + i) * x,
+                spread(factors, 6 * n + i) * x,
+            )
             a, b = fma(spread(factors, n + i), y, a), fma(spread(factors, 4 * n + i), y, b)
             c = fma(spread(factors, 7 * n + i), y, c)
             a, b = fma(spread(factors, 2 * n + i), z, a), fma(spread(factors, 5 * n + i), z, b)
@@ -70,7 +77,9 @@ def weights(points, factors, count, n, scale, out):
 
 @serial
 def column_sums(a, count, n, out):
-    """Sums of columns into out [n], what they lost to rounding into out [n:]: the true sum is their difference."""
+    """Sums of columns into out [n], what they lost to rounding into out [n:]: the true sum is their
+    difference.
+    """
     for j in range(0, n, 16):
         sums, lost = splat(ZERO), splat(ZERO)
         for i in range(count):
@@ -84,7 +93,9 @@ def column_sums(a, count, n, out):
 
 @serial
 def normalise(a, roots, u, count, n):
-    """a_ij <- u_i u_j − a_ij roots_i roots_j, of roots in two float32 each, [n] and [n:], rounded once or nearly so."""
+    """a_ij <- u_i u_j − a_ij roots_i roots_j, of roots in two float32 each, [n] and [n:], rounded
+    once or nearly so.
+    """
     for i in range(count):
         root, rest, lead = splat(-roots[i]), splat(-roots[n + i]), splat(u[i])
         for j in range(0, n, 16):
@@ -97,7 +108,9 @@ def normalise(a, roots, u, count, n):
 
 @serial
 def operator(points, metrics, count, n, scale, split, degrees, u, out):
-    """u uᵀ − S into out [n, n], and u [n], unless a degree is too small for float32. Returns: the least degree."""
+    """u uᵀ − S into out [n, n], and u [n], unless a degree is too small for float32. Returns: the
+    least degree.
+    """
     split[:] = ZERO
     for i in range(count):
         for k in range(3):
@@ -126,7 +139,8 @@ def operator(points, metrics, count, n, scale, split, degrees, u, out):
 def exact_operator(points, factors, count, n, bandwidth, u, out):
     """−S in float64 and logarithms, rounded once: right where every weight of a member underflows.
 
-    Here u = 0: a region like this falls apart into parts that each have a pair at −1, and zeros are exact.
+    Here u = 0: a region like this falls apart into parts that each have a pair at −1, and zeros are
+    exact.
     Args: points [n, 3], factors [n, 3, 3].
     """
     lengths, logs = np.empty((count, count)), np.empty(count)

@@ -17,7 +17,9 @@ class Described(NamedTuple, Generic[Values]):
 
 @dataclass(frozen=True)
 class Descriptor:
-    """Numbers of a descriptor, as in `settings.DescribeSection`: J angles, D degrees, a, the width."""
+    """Numbers of a descriptor, as in `settings.DescribeSection`: J angles, D degrees, a, the
+    width.
+    """
 
     n_angles: int = 8
     max_degree: int = 8

@@ -1,6 +1,7 @@
 """Chebyshev descriptors of regions of Gaussians (Eqs 4-6).
 
-Two backends agree to float32: `numba` is compiled, `reference` (torch) differentiable. Torch is imported where it is
+Two backends agree to float32: `numba` is compiled, `reference` (torch) differentiable. Torch is
+  imported where it is
 needed only: finished scenes are described without it.
 """
 
@@ -32,24 +33,35 @@ def describe(
     dtype: torch.dtype | None = None,
     backend: Literal["auto", "numba", "reference"] = "auto",
 ) -> Described[Tensor]:
-    """Descriptor of every Gaussian of every region: g^d(i) = n ([T_d(−S)]_ii − T_d(0)), by angle and degree.
+    """Descriptor of every Gaussian of every region: g^d(i) = n ([T_d(−S)]_ii − T_d(0)), by angle
+    and degree.
 
     Args:
       means, scales, rotmats, mask: [M, n, ...], as `albo.canonicalize`.
       dtype:   of the result, float32 if None; float64 by the reference only.
-      backend: `numba` (float32, no gradient; the same bits for any number of threads), `reference`, or
+      backend: `numba` (float32, no gradient; the same bits for any number of threads), `reference`,
+        or
         `auto`: numba where it can.
-    Returns: values [M, n, J, P], zero where padded and in regions of fewer than two Gaussians, which have no edge. Of
-      the full spectrum it is the printed formula with K = n and λ_max = 2, without degrees 0 and 1, which vanish.
+    Returns: values [M, n, J, P], zero where padded and in regions of fewer than two Gaussians,
+      which have no edge. Of the full spectrum it is the printed formula with K = n and λ_max = 2,
+      without degrees 0 and 1, which vanish.
     Raises: ValueError on sizes or parameters that make no sense, or that the backend does not take.
     """
     import torch
 
     w = wanted
     if w.n_angles < 1 or w.max_degree < 2 or not w.bandwidth > 0 or not w.anisotropy >= 0:
-        raise ValueError("n_angles >= 1, max_degree >= 2, bandwidth > 0 and anisotropy >= 0 are needed")
-    if means.shape != scales.shape or rotmats.shape != (*means.shape, 3) or mask.shape != means.shape[:2]:
-        raise ValueError(f"shapes disagree: {means.shape}, {scales.shape}, {rotmats.shape}, {mask.shape}")
+        raise ValueError(
+            "n_angles >= 1, max_degree >= 2, bandwidth > 0 and anisotropy >= 0 are needed"
+        )
+    if (
+        means.shape != scales.shape
+        or rotmats.shape != (*means.shape, 3)
+        or mask.shape != means.shape[:2]
+    ):
+        raise ValueError(
+            f"shapes disagree: {means.shape}, {scales.shape}, {rotmats.shape}, {mask.shape}"
+        )
     regions, dtype = (means, scales, rotmats, mask), dtype or torch.float32
     differentiable = any(v.requires_grad for v in regions)
     can_compile = dtype == torch.float32 and not differentiable
@@ -62,7 +74,9 @@ def describe(
     if not can_compile:
         raise ValueError("the numba backend takes float32 only, and no gradients")
     sizes = w.n_angles, w.max_degree, w.anisotropy, w.bandwidth
-    values, n_exact = _compiled(means.numpy(), scales.numpy(), rotmats.numpy(), mask.numpy(), *sizes)
+    values, n_exact = _compiled(
+        means.numpy(), scales.numpy(), rotmats.numpy(), mask.numpy(), *sizes
+    )
     return Described(torch.from_numpy(values), n_exact)
 
 
@@ -75,20 +89,27 @@ def describe_members(
     *,
     chunk: int = 2048,
 ) -> Described[np.ndarray]:
-    """Descriptors f32 [M, n, J, P] of regions whose members are gathered from Gaussians; without torch.
+    """Descriptors f32 [M, n, J, P] of regions whose members are gathered from Gaussians; without
+    torch.
 
     Args:
-      means:   [N, 3] scene units; quats [N, 4] wxyz, of any length; scales [N, 3] standard deviations, scene units.
+      means:   [N, 3] scene units; quats [N, 4] wxyz, of any length; scales [N, 3] standard
+        deviations, scene units.
       members: i64 [M, n], -1 where padded.
       chunk:   regions at a time, at most: bounds memory.
     """
     sizes = settings.n_angles, settings.max_degree, settings.anisotropy, settings.bandwidth
-    values, n_exact = np.zeros((*members.shape, settings.n_angles, settings.max_degree - 1), np.float32), 0
+    values, n_exact = (
+        np.zeros((*members.shape, settings.n_angles, settings.max_degree - 1), np.float32),
+        0,
+    )
     for start in range(0, len(members), chunk):
         part = members[start : start + chunk]
         index = np.maximum(part, 0)
         rotmats = rotation_matrices_f64(quats[index])
-        values[start : start + chunk], exact = _compiled(means[index], scales[index], rotmats, part >= 0, *sizes)
+        values[start : start + chunk], exact = _compiled(
+            means[index], scales[index], rotmats, part >= 0, *sizes
+        )
         n_exact += exact
     return Described(values, n_exact)
 
@@ -107,5 +128,7 @@ def _compiled(
     out = np.zeros((*mask.shape, n_angles, max_degree - 1), np.float32)
     exact = np.zeros(len(mask), np.bool_)
     parts = [np.ascontiguousarray(v, np.float64) for v in (means, scales, rotmats)]
-    descriptor_kernel.describe(*parts, np.ascontiguousarray(mask), float(anisotropy), float(bandwidth), out, exact)
+    descriptor_kernel.describe(
+        *parts, np.ascontiguousarray(mask), float(anisotropy), float(bandwidth), out, exact
+    )
     return out, int(exact.sum())

@@ -1,5 +1,5 @@
-"""Operator and centred Chebyshev recurrence of many regions in one compiled loop (Eqs 2-6): the fast twin of
-`descriptor_reference.describe`. Matrices are as in `albo_kernel`.
+"""Operator and centred Chebyshev recurrence of many regions in one compiled loop (Eqs 2-6): the
+fast twin of `descriptor_reference.describe`. Matrices are as in `albo_kernel`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,13 @@ import numpy as np
 
 from chebsplat.kernels.jit import kernel, prange, serial
 from chebsplat.kernels.simd import fma, load, splat, spread, store
-from chebsplat.shape.albo_kernel import LEAST_BANDWIDTH, LEAST_DEGREE, exact_operator, mirror, operator
+from chebsplat.shape.albo_kernel import (
+    LEAST_BANDWIDTH,
+    LEAST_DEGREE,
+    exact_operator,
+    mirror,
+    operator,
+)
 from chebsplat.shape.region_frame import canonical, metric, tangent_axis, turn_back
 
 BLOCK = 8  # regions that share scratch memory
@@ -41,7 +47,9 @@ def next_term(x, term, before, at_zero, count, n, out):
 
 @serial
 def row_products(a, b, count, n, out, start):
-    """Diagonal of a b into out[start:]; columns are summed, which for symmetric matrices are the rows."""
+    """Diagonal of a b into out[start:]; columns are summed, which for symmetric matrices are the
+    rows.
+    """
     for j in range(0, n, 16):
         sums = splat(ZERO)
         for i in range(count):
@@ -51,7 +59,8 @@ def row_products(a, b, count, n, out, start):
 
 @serial
 def diagonals(terms, u, max_degree, count, n, out):
-    """n ([T_d(−S)]_ii − T_d(0)) of degrees 2...max_degree into out [D - 1, n], from terms[1] = u uᵀ − S.
+    """n ([T_d(−S)]_ii − T_d(0)) of degrees 2...max_degree into out [D - 1, n], from terms[1] = u uᵀ
+    − S.
 
     T_d(−S) = T_d(u uᵀ − S) + (T_d(−1) − T_d(0)) u uᵀ, because S u = u; u may be zero.
     """
@@ -69,13 +78,17 @@ def diagonals(terms, u, max_degree, count, n, out):
         lead = sign - (ZERO if degree % 2 else (ONE if degree % 4 == 0 else -ONE))
         for i in range(count):
             at = i * n + i
-            value = TWO * (out[start + i] + m_zero * terms[k, at] + k_zero * terms[m, at]) - terms[k - m, at]
+            value = (
+                TWO * (out[start + i] + m_zero * terms[k, at] + k_zero * terms[m, at])
+                - terms[k - m, at]
+            )
             out[start + i] = np.float32(count) * (value + lead * u[i] * u[i])
 
 
 @serial
 def pair_angles(values, certainty, index, count, n, out):
-    """Replace angles j and J − j by half their sum and difference, faded by certainty, into out [slots, J, D - 1].
+    """Replace angles j and J − j by half their sum and difference, faded by certainty, into out
+    [slots, J, D - 1].
 
     Args: values [J, (D - 1) n], only the first angle filled where certainty is 0.
     """
@@ -131,7 +144,11 @@ def describe_block(first, last, means, scales, rotmats, mask, anisotropy, bandwi
             terms[0, i] = ZERO
         for j in range(n_angles if certainty > 0.0 else 1):
             turn_back(points, count, axis, 2.0 * math.pi * j / n_angles, turned)
-            least = operator(turned, metrics, count, n, scale, split, degrees, u, terms[1]) if scale > FINEST else ZERO
+            least = (
+                operator(turned, metrics, count, n, scale, split, degrees, u, terms[1])
+                if scale > FINEST
+                else ZERO
+            )
             if least < LEAST_DEGREE:
                 exact_operator(turned, factors, count, n, bandwidth, u, terms[1])
                 exact[r] = True
@@ -141,9 +158,11 @@ def describe_block(first, last, means, scales, rotmats, mask, anisotropy, bandwi
 
 @kernel
 def describe(means, scales, rotmats, mask, anisotropy, bandwidth, out, exact):
-    """Descriptors of regions into out f32 [M, n, J, D - 1], and into exact [M] which took the float64 operator.
+    """Descriptors of regions into out f32 [M, n, J, D - 1], and into exact [M] which took the
+    float64 operator.
 
-    Args: float64 means, scales [M, n, 3], rotmats [M, n, 3, 3]; mask [M, n] bool; out and exact zero.
+    Args: float64 means, scales [M, n, 3], rotmats [M, n, 3, 3]; mask [M, n] bool; out and exact
+      zero.
     """
     m = len(mask)
     for block in prange((m + BLOCK - 1) // BLOCK):

@@ -5,7 +5,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from chebsplat.shape.albo import canonicalize, metric_factors, rotations_about, similarity, tangent_axis
+from chebsplat.shape.albo import (
+    canonicalize,
+    metric_factors,
+    rotations_about,
+    similarity,
+    tangent_axis,
+)
 from chebsplat.shape.described import Descriptor
 
 
@@ -14,7 +20,8 @@ def chebyshev_diagonals(S: Tensor, max_degree: int) -> Tensor:
 
     Args: S [..., n, n] symmetric, spectrum within [-1, 1], zero diagonal.
     Returns: [..., n, max_degree - 1].
-    Choices: E_m = T_m − T_m(0) I is carried, so nothing of size 1 is ever subtracted; the diagonals of T_2m and
+    Choices: E_m = T_m − T_m(0) I is carried, so nothing of size 1 is ever subtracted; the diagonals
+      of T_2m and
     T_2m+1 are row products of T_m and T_m+1, so max_degree 8 costs three matrix products.
     """
     x = -S
@@ -41,10 +48,13 @@ def describe(
     *,
     dtype: torch.dtype,
 ) -> Tensor:
-    """Values as of `descriptor.describe`; `dtype` is that of the recurrence, all before it is float64.
+    """Values as of `descriptor.describe`; `dtype` is that of the recurrence, all before it is
+    float64.
 
-    Choices: angles j and J − j are replaced by half their sum and half their absolute difference, so that the sign of
-    the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis has no gradient.
+    Choices: angles j and J − j are replaced by half their sum and half their absolute difference,
+      so that the sign of
+    the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis
+    has no gradient.
     """
     region, n_angles = canonicalize(means, scales, rotmats, mask), wanted.n_angles
     factors = metric_factors(region, wanted.anisotropy)

@@ -1,5 +1,6 @@
-"""What scenes teach about shape, in closed form: sums over a scene's points, and the map from shape to meaning that
-many scenes' sums give. They commute, so that no scene is forgotten and no order matters (docs/method.md, section 14).
+"""What scenes teach about shape, in closed form: sums over a scene's points, and the map from shape
+to meaning that many scenes' sums give. They commute, so that no scene is forgotten and no order
+matters (docs/method.md, section 14).
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ class Sums(NamedTuple):
     square: float
 
     def spread(self) -> float:
-        """σ_f = √(Σ w |y − ȳ|²) of the meanings (Eq 15); the last feature is 1, so that the last row of b is ȳ."""
+        """σ_f = √(Σ w |y − ȳ|²) of the meanings (Eq 15); the last feature is 1, so that the last
+        row of b is ȳ.
+        """
         return float(np.sqrt(max(self.square - float(self.cross[-1] @ self.cross[-1]), 0.0)))
 
 
@@ -49,7 +52,8 @@ def summed(features: np.ndarray, meanings: np.ndarray, weights: np.ndarray) -> S
 
 
 def odds(n_views: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """How much each of N points teaches, f64 [N], sum 1: half alike, half by 1 / sqrt(frequency of its label).
+    """How much each of N points teaches, f64 [N], sum 1: half alike, half by 1 / sqrt(frequency of
+    its label).
 
     Args: n_views [N], that see it; labels [N] that its teacher gives it.
     Raises: DataFailure where none is seen in LEAST_VIEWS views.

@@ -1,8 +1,8 @@
 """The point encoder: what surrounds a point at several radii in, features of its shape out (Eq 7).
 
-It sees geometry alone and is taught (`taught`) once, over many rooms, so that it cannot repeat what a 2D teacher gets
-wrong for reasons of texture or of view. From then on it stays as it is: what its features mean, scenes teach by sums
-(`shape.lessons`; docs/method.md, section 14).
+It sees geometry alone and is taught (`taught`) once, over many rooms, so that it cannot repeat what
+a 2D teacher gets wrong for reasons of texture or of view. From then on it stays as it is: what its
+features mean, scenes teach by sums (`shape.lessons`; docs/method.md, section 14).
 """
 
 from __future__ import annotations
@@ -38,14 +38,16 @@ class Cloud(NamedTuple):
 def cloud_of(inputs: PointInputs) -> Cloud:
     """Tensors of the arrays; they share memory."""
     own, means, normals, descriptors = (torch.from_numpy(v) for v in inputs[:4])
-    return Cloud(own, means, normals, descriptors, torch.from_numpy(inputs.neighbors.astype(np.int64)))
+    return Cloud(
+        own, means, normals, descriptors, torch.from_numpy(inputs.neighbors.astype(np.int64))
+    )
 
 
 class Standardize(nn.Module):
     """Every input less its mean, over its deviation, within ±5; constants, no weights.
 
-    Choices: a LayerNorm over a point's descriptor would compare its degrees with one another: their means differ by
-      more than they vary from one point to the next.
+    Choices: a LayerNorm over a point's descriptor would compare its degrees with one another: their
+      means differ by more than they vary from one point to the next.
     """
 
     mean: Tensor
@@ -65,12 +67,14 @@ class Standardize(nn.Module):
 
 
 class Scale(nn.Module):
-    """One radius: a learned token attends to the neighbours' tokens (Eq 7), and beside it stands the mean of these.
+    """One radius: a learned token attends to the neighbours' tokens (Eq 7), and beside it stands
+    the mean of these.
 
-    Choices: a neighbour's token is f(G_i) + PE(c_i): its embedding and the point's own, and where it lies. One block,
-      normalised before; only the learned token is read of its attention, so that one query a head asks every point, and
-      keys and values need no matrix a neighbour. Where a radius holds nobody the token attends to itself alone.
-      Without attention, to measure it by, the largest of the tokens stands in the learned one's place.
+    Choices: a neighbour's token is f(G_i) + PE(c_i): its embedding and the point's own, and where
+      it lies. One block, normalised before; only the learned token is read of its attention, so
+      that one query a head asks every point, and keys and values need no matrix a neighbour. Where
+      a radius holds nobody the token attends to itself alone. Without attention, to measure it by,
+      the largest of the tokens stands in the learned one's place.
     """
 
     def __init__(self, width: int, hidden: int, attends: bool = True):
@@ -78,7 +82,9 @@ class Scale(nn.Module):
         self.attends = attends
         self.token = nn.Parameter(torch.randn(hidden) / hidden**0.5)
         self.point, self.neighbor = nn.Linear(width, hidden), nn.Linear(width, hidden, bias=False)
-        self.place = nn.Sequential(nn.Linear(N_RELATIVE, hidden), nn.SiLU(), nn.Linear(hidden, hidden, bias=False))
+        self.place = nn.Sequential(
+            nn.Linear(N_RELATIVE, hidden), nn.SiLU(), nn.Linear(hidden, hidden, bias=False)
+        )
         self.norm, self.norm_after = nn.LayerNorm(hidden), nn.LayerNorm(hidden)
         self.query, self.key = (nn.Linear(hidden, hidden, bias=False) for _ in range(2))
         self.value, self.out = (nn.Linear(hidden, hidden, bias=False) for _ in range(2))
@@ -92,16 +98,26 @@ class Scale(nn.Module):
         return asked
 
     def answered(self) -> Tensor:
-        """[heads, h, h]: from what each head has gathered of tokens to what it adds to the learned one, W_o W_v."""
+        """[heads, h, h]: from what each head has gathered of tokens to what it adds to the learned
+        one, W_o W_v.
+        """
         values = self.value.weight.reshape(N_HEADS, -1, self.value.in_features)
         out = self.out.weight.reshape(self.out.out_features, N_HEADS, -1)
         answered: Tensor = torch.einsum("hqd,ohq->hdo", values, out)
         return answered
 
-    def forward(self, embedded: Tensor, centers: Tensor, neighbors: Tensor, relative: Tensor) -> Tensor:
-        """embedded [U, width], centers [B], neighbors [B, K] rows of it, -1: none; relative [B, K, 10] -> [B, 2 h]."""
+    def forward(
+        self, embedded: Tensor, centers: Tensor, neighbors: Tensor, relative: Tensor
+    ) -> Tensor:
+        """embedded [U, width], centers [B], neighbors [B, K] rows of it, -1: none; relative [B, K,
+        10] -> [B, 2 h].
+        """
         present, rows = neighbors >= 0, neighbors.clamp_min(0)
-        tokens = self.point(embedded[centers])[:, None] + self.neighbor(embedded)[rows] + self.place(relative)
+        tokens = (
+            self.point(embedded[centers])[:, None]
+            + self.neighbor(embedded)[rows]
+            + self.place(relative)
+        )
         fed = (tokens + self.feed(self.norm_after(tokens))) * present[..., None]
         mean = fed.sum(1) / present.sum(1, keepdim=True).clamp_min(1)
         if not self.attends:
@@ -110,7 +126,8 @@ class Scale(nn.Module):
         normal, own = self.norm(tokens), self.norm(self.token)
         scores = (normal @ self.asked()).masked_fill(~present[..., None], -math.inf)
         scores = torch.cat([scores, (own @ self.asked()).expand(len(scores), 1, -1)], 1).softmax(1)
-        gathered = scores[:, :-1].transpose(1, 2) @ normal + scores[:, -1, :, None] * own  # [B, heads, h]
+        # [B, heads, h]
+        gathered = scores[:, :-1].transpose(1, 2) @ normal + scores[:, -1, :, None] * own
         token = self.token + torch.einsum("bhd,hdo->bo", gathered, self.answered())
         token = token + self.feed(self.norm_after(token))
         return torch.cat([token, mean], 1)
@@ -124,8 +141,8 @@ class PointEncoder(nn.Module):
       n_components:  that these are reduced to, whitened (`set_inputs`).
       n_channels:    of the teacher; n_scales: radii, the first of `RADII`.
       attends:       false: neighbours are pooled, not attended to.
-    Choices: z holds what the decoder sees and its last layer: the one carries over to other worlds better, the other is
-      better within one. A last 1 makes room for a constant.
+    Choices: z holds what the decoder sees and its last layer: the one carries over to other worlds
+      better, the other is better within one. A last 1 makes room for a constant.
     """
 
     components: Tensor
@@ -142,11 +159,22 @@ class PointEncoder(nn.Module):
     ):
         super().__init__()
         n_components = min(n_components, n_descriptors)
-        self.settings = {"n_channels": n_channels, "n_descriptors": n_descriptors, "n_components": n_components}
-        self.settings |= {"width": width, "hidden": hidden, "n_scales": n_scales, "attends": attends}
+        self.settings = {
+            "n_channels": n_channels,
+            "n_descriptors": n_descriptors,
+            "n_components": n_components,
+        }
+        self.settings |= {
+            "width": width,
+            "hidden": hidden,
+            "n_scales": n_scales,
+            "attends": attends,
+        }
         self.norm_own, self.norm_descriptors = Standardize(N_OWN), Standardize(n_descriptors)
         self.register_buffer("components", torch.zeros(n_descriptors, n_components))
-        self.embed = nn.Sequential(nn.Linear(N_OWN + n_components, 64), nn.SiLU(), nn.Linear(64, width))
+        self.embed = nn.Sequential(
+            nn.Linear(N_OWN + n_components, 64), nn.SiLU(), nn.Linear(64, width)
+        )
         self.scales = nn.ModuleList(Scale(width, hidden, attends) for _ in range(n_scales))
         total = width + 2 * hidden * n_scales
         self.decode = nn.Sequential(nn.Linear(total, 96), nn.SiLU(), nn.Linear(96, 96), nn.SiLU())
@@ -155,8 +183,8 @@ class PointEncoder(nn.Module):
 
     @torch.no_grad()
     def set_inputs(self, clouds: list[Cloud], sample: int = 11) -> None:
-        """Constants of the inputs, from every `sample`-th point: means, deviations, and the descriptors' principal
-        directions, each scaled to a deviation of 1.
+        """Constants of the inputs, from every `sample`-th point: means, deviations, and the
+        descriptors' principal directions, each scaled to a deviation of 1.
         """
         own = torch.cat([cloud.own[::sample] for cloud in clouds])
         self.norm_own.set(own.mean(0), own.std(0))
@@ -180,11 +208,15 @@ class PointEncoder(nn.Module):
         return embedded
 
     def forward(self, cloud: Cloud, embedded: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
-        """z [B, p] for rows `centers` [B]; `neighbors` [B, S, K] are rows of cloud and of embedded [U, width]."""
+        """z [B, p] for rows `centers` [B]; `neighbors` [B, S, K] are rows of cloud and of embedded
+        [U, width].
+        """
         parts = [embedded[centers]]
         for index, scale in enumerate(self.scales):
             rows = neighbors[:, index]
-            parts.append(scale(embedded, centers, rows, relative(cloud, centers, rows, RADII[index])))
+            parts.append(
+                scale(embedded, centers, rows, relative(cloud, centers, rows, RADII[index]))
+            )
         seen = torch.cat(parts, 1)
         return torch.cat([seen, self.decode(seen), torch.ones(len(seen), 1)], 1)
 
@@ -200,16 +232,20 @@ class PointEncoder(nn.Module):
         wanted = torch.arange(len(cloud.own)) if rows is None else torch.from_numpy(rows)
         embedded = self.embedded(cloud.own, cloud.descriptors)
         parts = [torch.zeros(0, self.n_features)]
-        parts += [self(cloud, embedded, some, cloud.neighbors[some]) for some in wanted.split(CHUNK)]
+        parts += [
+            self(cloud, embedded, some, cloud.neighbors[some]) for some in wanted.split(CHUNK)
+        ]
         return torch.cat(parts).numpy()
 
     @classmethod
     def restored(cls, settings: dict[str, Any], weights: dict[str, np.ndarray]) -> PointEncoder:
-        """Constructor settings, and weights by name; the head, which only teaching needs, may be missing. Raises
-        RuntimeError on a misfit.
+        """Constructor settings, and weights by name; the head, which only teaching needs, may be
+        missing. Raises RuntimeError on a misfit.
         """
         encoder = cls(**settings)
-        missing, extra = encoder.load_state_dict({n: torch.from_numpy(v) for n, v in weights.items()}, strict=False)
+        missing, extra = encoder.load_state_dict(
+            {n: torch.from_numpy(v) for n, v in weights.items()}, strict=False
+        )
         if extra or any(not name.startswith("head.") for name in missing):
             raise RuntimeError(f"weights do not fit the encoder: {[*missing, *extra][0]}")
         return encoder.eval()
@@ -220,9 +256,10 @@ def relative(cloud: Cloud, centers: Tensor, neighbors: Tensor, radius: float) ->
 
     Args: neighbors: rows of the cloud; -1 is none, whose values mean nothing; radius: metres.
 
-    Choices: the offset itself, its length, its length in the horizontal and its height's size; along the point's normal
-      and across it; the product of both normals, and the difference of normal · up. Teaching turns rooms about the
-      vertical, so that the offset's direction there says nothing.
+    Choices: the offset itself, its length, its length in the horizontal and its height's size;
+      along the point's normal and across it; the product of both normals, and the difference of
+      normal · up. Teaching turns rooms about the vertical, so that the offset's direction there
+      says nothing.
     """
     rows = neighbors.clamp_min(0)
     offset = (cloud.means[rows] - cloud.means[centers][:, None]) / radius
@@ -243,9 +280,9 @@ def relative(cloud: Cloud, centers: Tensor, neighbors: Tensor, radius: float) ->
 
 @dataclass
 class Example:
-    """A room to learn from: its cloud of N points, the mean of a teacher's unit features over the views that see a
-    point [N, C], how many these are [N], and the label that the teacher gives it [N], by which rare things are drawn
-    more often.
+    """A room to learn from: its cloud of N points, the mean of a teacher's unit features over the
+    views that see a point [N, C], how many these are [N], and the label that the teacher gives it
+    [N], by which rare things are drawn more often.
     """
 
     cloud: Cloud
@@ -267,9 +304,11 @@ class Course:
 
 
 def taught(encoder: PointEncoder, examples: list[Example], course: Course) -> Iterator[float]:
-    """Train in place; yields the loss of each step, the mean length of the difference to the teacher's mean features.
+    """Train in place; yields the loss of each step, the mean length of the difference to the
+    teacher's mean features.
 
-    Choices: one room a step, turned about the vertical and mirrored at random. AdamW, half a cosine.
+    Choices: one room a step, turned about the vertical and mirrored at random. AdamW, half a
+      cosine.
     """
     torch.manual_seed(course.seed)
     rng = np.random.default_rng(course.seed)
@@ -284,7 +323,9 @@ def taught(encoder: PointEncoder, examples: list[Example], course: Course) -> It
         chosen = np.sort(rng.permutation(example.cloud.neighbors.shape[2])[: course.n_neighbors])
         part, centers, neighbors = excerpt(example.cloud, rows, torch.from_numpy(chosen))
         part = turned(part, rng.uniform(0, 2 * math.pi), mirrored=bool(rng.random() < 0.5))
-        answers = encoder.answers(encoder(part, encoder.embedded(part.own, part.descriptors), centers, neighbors))
+        answers = encoder.answers(
+            encoder(part, encoder.embedded(part.own, part.descriptors), centers, neighbors)
+        )
         loss = (answers - example.features[rows]).norm(dim=1).mean()
         optimizer.zero_grad()
         loss.backward()

@@ -1,5 +1,5 @@
-"""One region in canonical units, its metric and its axis, in compiled float64: the twin of the torch functions in
-`albo`, which say why each step is as it is.
+"""One region in canonical units, its metric and its axis, in compiled float64: the twin of the
+torch functions in `albo`, which say why each step is as it is.
 
 Members that are masked or not finite are dropped here, so that what follows sees no padding.
 """
@@ -15,7 +15,8 @@ from chebsplat.kernels.jit import serial
 
 @serial
 def canonical(means, scales, rotmats, mask, index, points, sizes, frames):
-    """Canonical members in front: `index` their rows, points and sizes [count, 3], frames [count, 3, 3].
+    """Canonical members in front: `index` their rows, points and sizes [count, 3], frames [count,
+    3, 3].
 
     Args: means, scales [n, 3], rotmats [n, 3, 3], mask [n]; the others are filled.
     Returns: count.
@@ -63,7 +64,9 @@ def canonical(means, scales, rotmats, mask, index, points, sizes, frames):
 
 @serial
 def lower_median(values, count):
-    """The ((count + 1) // 2)-th smallest of values[:count], by ranks: `numpy.sort` takes a second to compile."""
+    """The ((count + 1) // 2)-th smallest of values[:count], by ranks: `numpy.sort` takes a second
+    to compile.
+    """
     wanted = (count - 1) // 2
     for i in range(count):
         rank = 0
@@ -77,7 +80,9 @@ def lower_median(values, count):
 
 @serial
 def metric(sizes, frames, count, anisotropy, largest, factors):
-    """Y_i = diag(sqrt(m_i)) R_iᵀ of each member into factors [count, 3, 3]; `largest` [n] is scratch."""
+    """Y_i = diag(sqrt(m_i)) R_iᵀ of each member into factors [count, 3, 3]; `largest` [n] is
+    scratch.
+    """
     for i in range(count):
         largest[i] = max(sizes[i, 0], sizes[i, 1], sizes[i, 2])
     typical = lower_median(largest, count)
@@ -94,7 +99,9 @@ def metric(sizes, frames, count, anisotropy, largest, factors):
 
 @serial
 def eigen(a, vectors):
-    """Eigenvalues of the symmetric a [3, 3] onto its diagonal, eigenvectors into the columns, by Jacobi's rotations."""
+    """Eigenvalues of the symmetric a [3, 3] onto its diagonal, eigenvectors into the columns, by
+    Jacobi's rotations.
+    """
     for i in range(3):
         for j in range(3):
             vectors[i, j] = 1.0 if i == j else 0.0
@@ -124,7 +131,9 @@ def eigen(a, vectors):
 
 @serial
 def tangent_axis(points, sizes, frames, count, axis):
-    """Least-variance axis of the region's Gaussian mixture, into `axis` [3]; returns its certainty in [0, 1]."""
+    """Least-variance axis of the region's Gaussian mixture, into `axis` [3]; returns its certainty
+    in [0, 1].
+    """
     widest = 1.0
     for i in range(count):
         widest = max(widest, sizes[i, 0], sizes[i, 1], sizes[i, 2])
@@ -158,7 +167,9 @@ def tangent_axis(points, sizes, frames, count, axis):
 
 @serial
 def turn_back(points, count, axis, angle, turned):
-    """Rotᵀ c of each point, Rot by `angle` about `axis`: turning every metric is turning the centres back."""
+    """Rotᵀ c of each point, Rot by `angle` about `axis`: turning every metric is turning the
+    centres back.
+    """
     sin, cos = math.sin(-angle), 1.0 - math.cos(angle)
     x, y, z = axis[0], axis[1], axis[2]
     for i in range(count):

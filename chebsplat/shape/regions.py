@@ -14,8 +14,10 @@ SAMPLE = 65536  # points that stand for all where only a density is wanted
 
 
 class Regions(NamedTuple):
-    """centers i64 [M] are indices of points, in farthest-point order; members i64 [M, n], -1 where padded, the centre
-    first. radius: scene units; no member is farther from its centre, and it is at least the centres' covering
+    """centers i64 [M] are indices of points, in farthest-point order; members i64 [M, n], -1 where
+    padded, the centre
+    first. radius: scene units; no member is farther from its centre, and it is at least the
+      centres' covering
     radius. share: the part of all points that members were taken from.
     """
 
@@ -30,14 +32,14 @@ def regions_of(means: np.ndarray, settings: DescribeSection) -> Regions:
 
     Args:
       means:       [N, 3] scene units; float64 where the scene is far from the origin.
-      settings:    how many regions and members at most; the seed of the first centre and of the thinning; the radius
-        over the covering radius.
+      settings:    how many regions and members at most; the seed of the first centre and of the
+        thinning; the radius over the covering radius.
     Returns: regions; zero of them for N = 0, fewer than n_regions where points coincide.
     Raises:  ValueError on non-finite means.
-    Choices: centres by farthest-point sampling; the radius is `overlap` times the covering radius, so that regions
-      overlap. Neighbours come from a thinned set of about `region_size` points a ball, else a region of the nearest
-      ones would shrink to a speck inside a dense ball; the centre itself is always a member. A point is thinned away
-      by a hash of its index.
+    Choices: centres by farthest-point sampling; the radius is `overlap` times the covering radius,
+      so that regions overlap. Neighbours come from a thinned set of about `region_size` points a
+      ball, else a region of the nearest ones would shrink to a speck inside a dense ball; the
+      centre itself is always a member. A point is thinned away by a hash of its index.
     """
     region_size = settings.region_size
     if not np.isfinite(means).all():
@@ -51,13 +53,16 @@ def regions_of(means: np.ndarray, settings: DescribeSection) -> Regions:
     centers, reach = farthest_points(means, n_regions, start)
     radius = settings.overlap * reach or 1.0
     share = _share(means, centers, radius, region_size, keys)
-    return Regions(centers, _neighbourhoods(means, centers, radius, share, region_size, keys), radius, share)
+    return Regions(
+        centers, _neighbourhoods(means, centers, radius, share, region_size, keys), radius, share
+    )
 
 
 def farthest_points(means: np.ndarray, count: int, start: int) -> tuple[np.ndarray, float]:
     """Indices [M] of points, each the farthest from those before it, and their covering radius.
 
-    Choices: M < count where only coincident points are left. Exact in float32 around the centroid. `start` is an
+    Choices: M < count where only coincident points are left. Exact in float32 around the centroid.
+      `start` is an
     index in the library's own order of the points: it seeds the first pick without naming it.
     """
     n = len(means)
@@ -77,27 +82,42 @@ def farthest_points(means: np.ndarray, count: int, start: int) -> tuple[np.ndarr
     return centers, float(np.linalg.norm(means[centers] - means[picked[count]], axis=1).min())
 
 
-def _share(means: np.ndarray, centers: np.ndarray, radius: float, region_size: int, keys: np.ndarray) -> float:
+def _share(
+    means: np.ndarray, centers: np.ndarray, radius: float, region_size: int, keys: np.ndarray
+) -> float:
     """The part of the points that leaves the median ball `region_size` of them."""
     n = len(means)
     sample = means if n <= SAMPLE else means[np.argpartition(keys, SAMPLE)[:SAMPLE]]
-    counts = _tree(sample).query_ball_point(means[centers[:64]], radius, workers=-1, return_length=True)
+    counts = _tree(sample).query_ball_point(
+        means[centers[:64]], radius, workers=-1, return_length=True
+    )
     ball = float(np.median(counts)) * n / len(sample)
     return min(1.0, max(region_size / max(ball, 1.0), min(n, region_size) / n))
 
 
 def _neighbourhoods(
-    means: np.ndarray, centers: np.ndarray, radius: float, share: float, region_size: int, keys: np.ndarray
+    means: np.ndarray,
+    centers: np.ndarray,
+    radius: float,
+    share: float,
+    region_size: int,
+    keys: np.ndarray,
 ) -> np.ndarray:
-    """members i64 [M, region_size]: the centre, then the nearest of the thinned points within the radius."""
+    """members i64 [M, region_size]: the centre, then the nearest of the thinned points within the
+    radius.
+    """
     thinned = np.flatnonzero(keys < share)
     where = means[centers]
     k = min(region_size, max(len(thinned), 1))
     members = np.full((len(where), region_size), -1, np.int64)
     if len(thinned):
-        distance, index = _tree(means[thinned]).query(where, k, distance_upper_bound=radius * (1 + 1e-9), workers=-1)
+        distance, index = _tree(means[thinned]).query(
+            where, k, distance_upper_bound=radius * (1 + 1e-9), workers=-1
+        )
         distance, index = distance.reshape(len(where), k), index.reshape(len(where), k)
-        members[:, :k] = np.where(np.isfinite(distance), thinned[np.minimum(index, len(thinned) - 1)], -1)
+        members[:, :k] = np.where(
+            np.isfinite(distance), thinned[np.minimum(index, len(thinned) - 1)], -1
+        )
     return _centre_first(members, centers)
 
 
@@ -106,7 +126,9 @@ def _tree(points: np.ndarray) -> cKDTree:
 
 
 def _uniform(ids: np.ndarray, seed: int) -> np.ndarray:
-    """A number in [0, 1) for each id and seed, by a mixing of bits in which every one reaches every other."""
+    """A number in [0, 1) for each id and seed, by a mixing of bits in which every one reaches every
+    other.
+    """
     x = np.asarray(ids, np.uint64) + np.uint64(1 + (seed << 32) % 2**63)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)

@@ -1,4 +1,5 @@
-"""Gaussian parameters: from points with local shape to raw parameters, and from raw to activated values.
+"""Gaussian parameters: from points with local shape to raw parameters, and from raw to activated
+values.
 
 Rows chosen by an index have a cheap gradient.
 """
@@ -19,7 +20,9 @@ from chebsplat.splats.rotations import rotation_matrices, rotation_matrices_f64
 _C0 = 0.28209479177387814
 
 
-def local_shape(means: np.ndarray, n_neighbors: int, floor: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+def local_shape(
+    means: np.ndarray, n_neighbors: int, floor: float = 0.05
+) -> tuple[np.ndarray, np.ndarray]:
     """Local covariances by PCA over neighbours (docs/method.md, section 1).
 
     Args:
@@ -27,9 +30,9 @@ def local_shape(means: np.ndarray, n_neighbors: int, floor: float = 0.05) -> tup
       n_neighbors: how many neighbours shape a point.
       floor:       least standard deviation, as a fraction of the spacing.
     Returns: covariances [N, 3, 3] and normals [N, 3] (unit, of arbitrary sign), float32.
-    Choices: in-plane deviations follow the neighbourhood's but are scaled so that the larger one equals the
-      spacing (rms distance of the three nearest); the normal one is the residual at that scale. Coincident points
-      take the median spacing, so no scale is zero.
+    Choices: in-plane deviations follow the neighbourhood's but are scaled so that the larger one
+      equals the spacing (rms distance of the three nearest); the normal one is the residual at that
+      scale. Coincident points take the median spacing, so no scale is zero.
     """
     k = min(n_neighbors, len(means) - 1)
     distances, index = cKDTree(means).query(means, k + 1, workers=-1)
@@ -52,7 +55,8 @@ def initial_gaussians(
 ) -> dict[str, Tensor]:
     """Raw parameters (float32) of Gaussians that start from points.
 
-    Args: means [N, 3]; colors u8 [N, 3]; covariances [N, 3, 3] symmetric positive definite, scene units².
+    Args: means [N, 3]; colors u8 [N, 3]; covariances [N, 3, 3] symmetric positive definite, scene
+      units².
     Returns: `means`, `log_scales`, `quats` (wxyz, unit), `logit_opacities`, `sh0` [N,1,3].
     """
     values, axes = np.linalg.eigh(np.asarray(covariances, np.float64))
@@ -67,7 +71,10 @@ def initial_gaussians(
         "logit_opacities": np.full(n, np.log(opacity / (1 - opacity))),
         "sh0": sh0_of(colors),
     }
-    return {name: torch.as_tensor(np.ascontiguousarray(value), dtype=torch.float32) for name, value in raw.items()}
+    return {
+        name: torch.as_tensor(np.ascontiguousarray(value), dtype=torch.float32)
+        for name, value in raw.items()
+    }
 
 
 def sh0_of(colors: np.ndarray) -> np.ndarray:
@@ -76,7 +83,9 @@ def sh0_of(colors: np.ndarray) -> np.ndarray:
 
 
 def activated(raw: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(means [N, 3], quats [N, 4], scales [N, 3] > 0, opacities [N] in (0, 1)) of raw parameters."""
+    """(means [N, 3], quats [N, 4], scales [N, 3] > 0, opacities [N] in (0, 1)) of raw
+    parameters.
+    """
     return raw["means"], raw["quats"], raw["log_scales"].exp(), raw["logit_opacities"].sigmoid()
 
 
@@ -87,9 +96,11 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
 
 
 def surface_of(parameters: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Normals f32 [N, 3], unit and of any sign, and colours f32 [N, 3] in [0, 1], of raw parameters.
+    """Normals f32 [N, 3], unit and of any sign, and colours f32 [N, 3] in [0, 1], of raw
+    parameters.
 
-    Choices: the normal is the shortest axis, the first of equal ones; the colour that of SH degree 0.
+    Choices: the normal is the shortest axis, the first of equal ones; the colour that of SH degree
+      0.
     """
     axes = rotation_matrices_f64(parameters["quats"])
     normals = axes[np.arange(len(axes)), :, parameters["log_scales"].argmin(1)]
@@ -98,7 +109,9 @@ def surface_of(parameters: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.nda
 
 
 class _Take(torch.autograd.Function):
-    """Rows by an index without repeats: the gradient is one scatter, where plain indexing has to accumulate."""
+    """Rows by an index without repeats: the gradient is one scatter, where plain indexing has to
+    accumulate.
+    """
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, index: Tensor) -> Tensor:

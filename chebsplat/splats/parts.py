@@ -20,9 +20,11 @@ FARTHEST = 2.0**40  # cubes from the origin along an axis; what lies beyond coun
 def parts(means: np.ndarray, scales: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Number of the part of each chosen Gaussian, i64 [N], the largest part 0; -1 for all others.
 
-    Args: means [N, 3]; scales [N, 3] standard deviations, activated; both scene units; chosen: bool [N].
-    Choices: two touch if the spheres of two standard deviations along their longest axes do; each is held against its
-      16 nearest, which is symmetrised by union. Parts of one size are in order of their first Gaussians.
+    Args: means [N, 3]; scales [N, 3] standard deviations, activated; both scene units; chosen: bool
+      [N].
+    Choices: two touch if the spheres of two standard deviations along their longest axes do; each
+      is held against its 16 nearest, which is symmetrised by union. Parts of one size are in order
+      of their first Gaussians.
     """
     found, rows = np.full(len(chosen), -1, np.int64), np.flatnonzero(chosen)
     n = len(rows)
@@ -40,8 +42,12 @@ def parts(means: np.ndarray, scales: np.ndarray, chosen: np.ndarray) -> np.ndarr
     return found
 
 
-def substantial(means: np.ndarray, scales: np.ndarray, chosen: np.ndarray, least: float = 0.1) -> np.ndarray:
-    """The chosen without their crumbs: bool [N], those of parts of at least a share `least` of the largest part."""
+def substantial(
+    means: np.ndarray, scales: np.ndarray, chosen: np.ndarray, least: float = 0.1
+) -> np.ndarray:
+    """The chosen without their crumbs: bool [N], those of parts of at least a share `least` of the
+    largest part.
+    """
     numbers = parts(means, scales, chosen)
     sizes = np.bincount(numbers[chosen])
     kept: np.ndarray = chosen.copy()
@@ -72,8 +78,8 @@ def first_of_each(points: np.ndarray, edge: float, origin: Corner = None) -> np.
 def means_of_each(cube: np.ndarray, least: float, *values: np.ndarray) -> tuple[np.ndarray, ...]:
     """Cubes that hold enough points, bool [M], and of these the means of values [N, 3].
 
-    Args: cube [N]: of each point, from 0; least: share of the number of points in the median point's cube that a
-      cube must hold, and three at least.
+    Args: cube [N]: of each point, from 0; least: share of the number of points in the median
+      point's cube that a cube must hold, and three at least.
     """
     count = np.bincount(cube)
     is_dense = count >= max(3, least * np.median(count[cube]))

@@ -1,5 +1,5 @@
-"""Colour by real spherical harmonics, in 3DGS's basis and sign convention; of each Gaussian in view, the bands that it
-has and that its masks keep.
+"""Colour by real spherical harmonics, in 3DGS's basis and sign convention; of each Gaussian in
+view, the bands that it has and that its masks keep.
 """
 
 from __future__ import annotations
@@ -61,10 +61,12 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def light(coefficients: Tensor, directions: Tensor, degree: int, backend: str = "auto") -> Tensor:
-    """Light [N, 3] along directions [N, 3], normalised here, of coefficients [N, at least (degree + 1)², 3].
+    """Light [N, 3] along directions [N, 3], normalised here, of coefficients [N, at least (degree +
+    1)², 3].
 
     Raises: ImportError, with the remedy, on a GPU without gsplat, unless backend is `reference`.
-    Choices: on a GPU gsplat's own kernel: fifty operations there would be fifty launches to wait for.
+    Choices: on a GPU gsplat's own kernel: fifty operations there would be fifty launches to wait
+      for.
     """
     if coefficients.device.type == "cuda" and backend != "reference":
         seen: Tensor = gsplat().spherical_harmonics(degree, directions, coefficients)
@@ -115,15 +117,17 @@ def colors_in_view(
     degree: int,
     backend: str = "auto",
 ) -> Tensor:
-    """Colours [V, 3], at least 0, of the Gaussians `index` i64 [V] (no row twice; None: all) as seen from `eye` [3].
+    """Colours [V, 3], at least 0, of the Gaussians `index` i64 [V] (no row twice; None: all) as
+    seen from `eye` [3].
 
-    Args: bands: coefficients [N_l, 2 l + 1, 3] of bands 0 to 3 or fewer: the first N_l Gaussians have band l,
-      N = N_0 ≥ N_1 ≥ ...; masks [V, 3] nested, of bands 1 to 3, None for all open; means [N, 3]; degree: the highest
-      band to use; backend: of `rasterize`.
+    Args: bands: coefficients [N_l, 2 l + 1, 3] of bands 0 to 3 or fewer: the first N_l Gaussians
+      have band l, N = N_0 ≥ N_1 ≥ ...; masks [V, 3] nested, of bands 1 to 3, None for all open;
+      means [N, 3]; degree: the highest band to use; backend: of `rasterize`.
     Raises: ValueError if the degree is not within 0 and 3.
-    Choices: no gradient reaches the means through the view's direction; a band that is not used gets no gradient at
-      all, so that the optimizer leaves it out. A colour that is cut off at 0 keeps the gradient that would lift it: a
-      Gaussian that begins black, or has become so, can be seen again.
+    Choices: no gradient reaches the means through the view's direction; a band that is not used
+      gets no gradient at all, so that the optimizer leaves it out. A colour that is cut off at 0
+      keeps the gradient that would lift it: a Gaussian that begins black, or has become so, can be
+        seen again.
     """
     if not 0 <= degree <= 3:
         raise ValueError(f"degree {degree} is not within 0 and 3")
@@ -136,12 +140,17 @@ def colors_in_view(
 
 
 def _coefficients(bands: Sequence[Tensor], masks: Tensor | None, index: Tensor | None) -> Tensor:
-    """Masked coefficients [V, K, 3] of all bands. Choices: a band that only the first Gaussians have is filled up with
+    """Masked coefficients [V, K, 3] of all bands. Choices: a band that only the first Gaussians
+    have is filled up with
     zeros, rather than cut to those in view that have it: a cut has to wait for their number.
     """
     parts, n = [], len(bands[0])
     for at, band in enumerate(bands):
-        whole = band if len(band) == n else torch.nn.functional.pad(band, (0, 0, 0, 0, 0, n - len(band)))
+        whole = (
+            band
+            if len(band) == n
+            else torch.nn.functional.pad(band, (0, 0, 0, 0, 0, n - len(band)))
+        )
         rows = take(whole, index)
         parts.append(rows if masks is None or at == 0 else rows * masks[:, at - 1, None, None])
     return torch.cat(parts, 1)

@@ -1,7 +1,9 @@
-"""Colour by spherical harmonics of the Gaussians in view, in numba: a Gaussian costs only the bands it keeps.
+"""Colour by spherical harmonics of the Gaussians in view, in numba: a Gaussian costs only the bands
+it keeps.
 
-Reads and writes whole parameters, so that no copy of the coefficients in view is ever made. A band is a tensor
-[N_l, 2 l + 1, 3] that the first N_l Gaussians have. `sh` holds the plain twin, and chooses.
+Reads and writes whole parameters, so that no copy of the coefficients in view is ever made. A band
+is a tensor [N_l, 2 l + 1, 3] that the first N_l Gaussians have. `sh` holds the plain twin, and
+chooses.
 """
 
 from __future__ import annotations
@@ -41,7 +43,9 @@ def _basis(means, eye, i, degree, out):
 
 @body
 def _kept(bands, n_held, i, v, degree):
-    """The highest band that counts for Gaussian i, row v of the masks: it has it, and so for all bands below."""
+    """The highest band that counts for Gaussian i, row v of the masks: it has it, and so for all
+    bands below.
+    """
     top = 0
     while top < degree and i < n_held[top] and bands[v, top] != 0:
         top += 1
@@ -91,7 +95,9 @@ def _clear(out, i):
 
 @kernel
 def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_bands):
-    """Gradients to sh0, to each band and, if asked for, to the masks [V, 3] (straight through closed ones too)."""
+    """Gradients to sh0, to each band and, if asked for, to the masks [V, 3] (straight through
+    closed ones too).
+    """
     n, n_held = len(means), (len(sh1), len(sh2), len(sh3))
     to_sh0, to_sh1 = np.empty((n, 1, 3), np.float32), np.empty(sh1.shape, np.float32)
     to_sh2, to_sh3 = np.empty(sh2.shape, np.float32), np.empty(sh3.shape, np.float32)
@@ -129,7 +135,9 @@ def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_ba
 class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, sh0, sh1, sh2, sh3, masks, index, means, eye, degree):
-        arrays = [t.detach().contiguous().numpy() for t in (sh0, sh1, sh2, sh3, masks, index, means, eye)]
+        arrays = [
+            t.detach().contiguous().numpy() for t in (sh0, sh1, sh2, sh3, masks, index, means, eye)
+        ]
         out = _forward(*arrays, degree)
         ctx.arrays, ctx.degree, ctx.out = arrays, degree, out
         return torch.from_numpy(out)
@@ -137,15 +145,24 @@ class _Colors(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         for_bands = ctx.needs_input_grad[4]
-        gradients = _backward(*ctx.arrays[1:], ctx.degree, ctx.out, grad.contiguous().numpy(), for_bands)
+        gradients = _backward(
+            *ctx.arrays[1:], ctx.degree, ctx.out, grad.contiguous().numpy(), for_bands
+        )
         parts = [torch.from_numpy(a) for a in gradients]
         return *parts[:4], parts[4] if for_bands else None, None, None, None, None
 
 
 def colors_in_view(
-    bands: Sequence[Tensor], masks: Tensor | None, index: Tensor, means: Tensor, eye: Tensor, degree: int
+    bands: Sequence[Tensor],
+    masks: Tensor | None,
+    index: Tensor,
+    means: Tensor,
+    eye: Tensor,
+    degree: int,
 ) -> Tensor:
-    """As `sh.colors_in_view`, of float32 on the CPU; a closed band costs nothing, unless its mask learns."""
+    """As `sh.colors_in_view`, of float32 on the CPU; a closed band costs nothing, unless its mask
+    learns.
+    """
     used = [band if at <= degree else band[:0].detach() for at, band in enumerate(bands)]
     used += [bands[0].new_zeros(0, 2 * at + 1, 3) for at in range(len(used), 4)]
     if masks is None:

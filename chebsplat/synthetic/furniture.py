@@ -1,4 +1,6 @@
-"""Furniture from parametric solids. Every piece stands at its frame's origin, its back at local y = 0, facing +y."""
+"""Furniture from parametric solids. Every piece stands at its frame's origin, its back at local y =
+0, facing +y.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +11,36 @@ from chebsplat.synthetic.mesh import Builder, Frame
 Generator = np.random.Generator
 
 
-def legs(b: Builder, label: str, material: int, f: Frame, width: float, depth: float, top: float, side: float) -> None:
+def legs(
+    b: Builder,
+    label: str,
+    material: int,
+    f: Frame,
+    width: float,
+    depth: float,
+    top: float,
+    side: float,
+) -> None:
     """Four square legs at the corners of a width x depth top."""
     for x in (-width / 2, width / 2 - side):
         for y in (0.0, depth - side):
             b.box(label, material, f, (x, y, 0), (x + side, y + side, top))
 
 
-def desk(b: Builder, f: Frame, wood: int, metal: int, width: float = 1.4, depth: float = 0.7) -> None:
+def desk(
+    b: Builder, f: Frame, wood: int, metal: int, width: float = 1.4, depth: float = 0.7
+) -> None:
     b.box("desk", wood, f, (-width / 2, 0, 0.70), (width / 2, depth, 0.74))
     legs(b, "desk", metal, f, width, depth, 0.70, 0.05)
     b.box("desk", wood, f, (width / 2 - 0.45, 0.05, 0.12), (width / 2 - 0.06, depth - 0.05, 0.68))
     for z in (0.30, 0.49):
-        b.box("desk", metal, f, (width / 2 - 0.33, depth - 0.05, z), (width / 2 - 0.18, depth - 0.03, z + 0.02))
+        b.box(
+            "desk",
+            metal,
+            f,
+            (width / 2 - 0.33, depth - 0.05, z),
+            (width / 2 - 0.18, depth - 0.03, z + 0.02),
+        )
 
 
 def monitor(b: Builder, f: Frame, frame: int, screen: int, width: float = 0.56) -> None:
@@ -29,7 +48,13 @@ def monitor(b: Builder, f: Frame, frame: int, screen: int, width: float = 0.56) 
     b.box("monitor", frame, f, (-0.12, 0.02, 0), (0.12, 0.2, 0.015))
     b.box("monitor", frame, f, (-0.02, 0.08, 0), (0.02, 0.11, 0.22))
     b.box("monitor", frame, f, (-width / 2, 0.11, 0.12), (width / 2, 0.15, 0.12 + height))
-    b.box("monitor", screen, f, (-width / 2 + 0.02, 0.15, 0.14), (width / 2 - 0.02, 0.153, 0.10 + height))
+    b.box(
+        "monitor",
+        screen,
+        f,
+        (-width / 2 + 0.02, 0.15, 0.14),
+        (width / 2 - 0.02, 0.153, 0.10 + height),
+    )
 
 
 def keyboard(b: Builder, f: Frame, material: int) -> None:
@@ -52,7 +77,9 @@ def table(b: Builder, f: Frame, wood: int, width: float, depth: float, height: f
 
 
 def chair(b: Builder, f: Frame, wood: int, fabric: int) -> None:
-    """A chair with the legs of the table's wood: same texture, another shape. It faces +y; its back is at y = 0."""
+    """A chair with the legs of the table's wood: same texture, another shape. It faces +y; its back
+    is at y = 0.
+    """
     b.box("chair", fabric, f, (-0.21, 0, 0.43), (0.21, 0.42, 0.48))
     legs(b, "chair", wood, f, 0.42, 0.42, 0.43, 0.04)
     for x in (-0.21, 0.17):
@@ -62,7 +89,13 @@ def chair(b: Builder, f: Frame, wood: int, fabric: int) -> None:
 
 def office_chair(b: Builder, f: Frame, metal: int, fabric: int) -> None:
     for k in range(5):
-        b.box("chair", metal, f.moved(0, 0.22, 0, 2 * np.pi * k / 5), (-0.02, 0, 0.03), (0.02, 0.28, 0.07))
+        b.box(
+            "chair",
+            metal,
+            f.moved(0, 0.22, 0, 2 * np.pi * k / 5),
+            (-0.02, 0, 0.03),
+            (0.02, 0.28, 0.07),
+        )
     b.revolved("chair", metal, f.moved(0, 0.22, 0), [(0.03, 0.05), (0.03, 0.44)], 12)
     b.box("chair", fabric, f, (-0.23, 0, 0.44), (0.23, 0.45, 0.52))
     b.box("chair", metal, f, (-0.03, -0.02, 0.5), (0.03, 0.01, 0.7))
@@ -79,21 +112,39 @@ def sofa(b: Builder, f: Frame, fabric: int, cushion: tuple[int, int], width: flo
         x = -width / 2 + 0.16 + k * inner
         b.box("sofa", fabric, f, (x + 0.01, 0.2, 0.26), (x + inner - 0.01, 0.82, 0.42))
         side = 0.28 if k == 0 else inner - 0.28
-        b.pillow("cushion", cushion[k], f.moved(x + side, 0.3, 0.42, 0.25 - 0.5 * k), (0.42, 0.18, 0.4))
+        b.pillow(
+            "cushion", cushion[k], f.moved(x + side, 0.3, 0.42, 0.25 - 0.5 * k), (0.42, 0.18, 0.4)
+        )
 
 
-def cabinet(b: Builder, f: Frame, body: int, metal: int, width: float, height: float, depth: float = 0.45) -> None:
+def cabinet(
+    b: Builder, f: Frame, body: int, metal: int, width: float, height: float, depth: float = 0.45
+) -> None:
     b.box("cabinet", body, f, (-width / 2, 0, 0.06), (width / 2, depth, height))
     b.box("cabinet", metal, f, (-width / 2 + 0.03, 0.03, 0), (width / 2 - 0.03, depth - 0.03, 0.06))
     n = max(2, round(width / 0.5))
     for k in range(n):
         x = -width / 2 + k * width / n
-        b.box("cabinet", body, f, (x + 0.015, depth, 0.09), (x + width / n - 0.015, depth + 0.02, height - 0.03))
+        b.box(
+            "cabinet",
+            body,
+            f,
+            (x + 0.015, depth, 0.09),
+            (x + width / n - 0.015, depth + 0.02, height - 0.03),
+        )
         handle = x + width / n - 0.07 if k % 2 == 0 else x + 0.05
-        b.box("cabinet", metal, f, (handle, depth + 0.02, 0.55 * height), (handle + 0.02, depth + 0.045, 0.72 * height))
+        b.box(
+            "cabinet",
+            metal,
+            f,
+            (handle, depth + 0.02, 0.55 * height),
+            (handle + 0.02, depth + 0.045, 0.72 * height),
+        )
 
 
-def shelf(b: Builder, f: Frame, wood: int, books: list[int], rng: Generator, width: float, height: float) -> None:
+def shelf(
+    b: Builder, f: Frame, wood: int, books: list[int], rng: Generator, width: float, height: float
+) -> None:
     """An open shelf, part filled with books."""
     depth, thick = 0.3, 0.025
     for x in (-width / 2, width / 2 - thick):
@@ -105,14 +156,22 @@ def shelf(b: Builder, f: Frame, wood: int, books: list[int], rng: Generator, wid
         b.box("shelf", wood, f, (-width / 2, 0, z), (width / 2, depth, z + thick))
         if k < n and rng.random() < 0.85:
             start = -width / 2 + 0.04 + rng.uniform(0, 0.25) * width
-            row_of_books(b, f.moved(start, 0.03, z + thick), books, rng, rng.uniform(0.35, 0.6) * width)
+            row_of_books(
+                b, f.moved(start, 0.03, z + thick), books, rng, rng.uniform(0.35, 0.6) * width
+            )
 
 
 def row_of_books(b: Builder, f: Frame, books: list[int], rng: Generator, length: float) -> None:
     x = 0.0
     while x < length:
         thickness, height = rng.uniform(0.025, 0.06), rng.uniform(0.18, 0.28)
-        b.box("book", int(rng.choice(books)), f, (x, 0, 0), (x + thickness, rng.uniform(0.14, 0.2), height))
+        b.box(
+            "book",
+            int(rng.choice(books)),
+            f,
+            (x, 0, 0),
+            (x + thickness, rng.uniform(0.14, 0.2), height),
+        )
         x += thickness + 0.002
 
 
@@ -126,18 +185,32 @@ def lying_books(b: Builder, f: Frame, books: list[int], rng: Generator) -> None:
 
 
 def bin_(b: Builder, f: Frame, material: int) -> None:
-    b.revolved("bin", material, f.moved(0, 0.16, 0), [(0.11, 0), (0.15, 0.36), (0.14, 0.36), (0.105, 0.03)])
+    b.revolved(
+        "bin", material, f.moved(0, 0.16, 0), [(0.11, 0), (0.15, 0.36), (0.14, 0.36), (0.105, 0.03)]
+    )
 
 
 def plant(
-    b: Builder, f: Frame, pot: int, green: int, rng: Generator, height: float = 0.9, behind: float = 0.19
+    b: Builder,
+    f: Frame,
+    pot: int,
+    green: int,
+    rng: Generator,
+    height: float = 0.9,
+    behind: float = 0.19,
 ) -> None:
-    """Leaves spread to all sides, but grow steeply where only `behind` metres are left to the wall."""
+    """Leaves spread to all sides, but grow steeply where only `behind` metres are left to the
+    wall.
+    """
     middle = f.moved(0, 0.22, 0)
     b.revolved("plant", pot, middle, [(0.11, 0), (0.16, 0.3), (0.14, 0.3), (0.13, 0.26)])
     for k in range(16):
         turn = 2 * np.pi * k * 0.382
-        length, width, bend = height * rng.uniform(0.6, 1.0), rng.uniform(0.09, 0.14), rng.uniform(0.5, 1.0)
+        length, width, bend = (
+            height * rng.uniform(0.6, 1.0),
+            rng.uniform(0.09, 0.14),
+            rng.uniform(0.5, 1.0),
+        )
         free = (behind - 0.5 * width * abs(np.sin(turn))) / max(-np.cos(turn), 1e-6)
         reach = min(0.55 * length, max(free, 0.05))
         b.leaf("plant", green, middle.moved(0, 0, 0.25, turn), length, reach, width, bend)
@@ -177,7 +250,9 @@ def door(b: Builder, f: Frame, wood: int, metal: int) -> None:
     b.box("door", metal, f, (0.32, 0.04, 1.0), (0.41, 0.09, 1.03))
 
 
-def window(b: Builder, f: Frame, white: int, glass: int, slat: int, width: float, closed: float) -> None:
+def window(
+    b: Builder, f: Frame, white: int, glass: int, slat: int, width: float, closed: float
+) -> None:
     """A window from 0.9 to 2.2 m, its blinds let down over the share `closed`."""
     b.box("window", glass, f, (-width / 2, 0, 0.9), (width / 2, 0.01, 2.2))
     for x in (-width / 2 - 0.05, -0.025, width / 2):
@@ -188,4 +263,10 @@ def window(b: Builder, f: Frame, white: int, glass: int, slat: int, width: float
     b.box("blinds", slat, f, (-width / 2, 0.06, 2.2), (width / 2, 0.11, 2.26))
     for k in range(n):
         z = 2.17 - 0.06 * k
-        b.box("blinds", slat, f, (-width / 2, 0.065 + 0.01 * (k % 2), z - 0.045), (width / 2, 0.085, z))
+        b.box(
+            "blinds",
+            slat,
+            f,
+            (-width / 2, 0.065 + 0.01 * (k % 2), z - 0.045),
+            (width / 2, 0.085, z),
+        )

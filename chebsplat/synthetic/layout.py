@@ -1,4 +1,6 @@
-"""Whole rooms: what stands where, in which material, under which light; and which seeds are for what."""
+"""Whole rooms: what stands where, in which material, under which light; and which seeds are for
+what.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +17,17 @@ Tone = Sequence[float] | np.ndarray  # red, green, blue; linear, in [0, 1]
 WHITE = (0.78, 0.77, 0.74)
 SCENES = range(1000)  # named scenes and tests
 REFERENCE = range(8000, 8100)  # views that a teacher's channels are computed from
-HELD_OUT = range(9000, 9020)  # the embedded teacher is measured on these: the first half offices, the others rooms
+# the embedded teacher is measured on these: the first half offices, the others rooms
+HELD_OUT = range(9000, 9020)
 TRAINING = range(10_000, 20_000)  # the embedded teacher is trained on these
 KNOWLEDGE = range(20_000, 21_000)  # knowledge is taught on these
 
 
 @dataclass
 class Room:
-    """A scene to render: geometry, materials, and lights [L, 2, 3] (centre, half extent) in metres."""
+    """A scene to render: geometry, materials, and lights [L, 2, 3] (centre, half extent) in
+    metres.
+    """
 
     soup: Soup
     materials: list[Material]
@@ -74,14 +79,20 @@ class Palette:
         return tone, np.clip(tone * self.rng.uniform(0.4, 0.8) + self.rng.uniform(0, 0.1), 0, 0.9)
 
 
-def shell(b: Builder, p: Palette, rng: np.random.Generator, size: tuple[float, float, float]) -> None:
+def shell(
+    b: Builder, p: Palette, rng: np.random.Generator, size: tuple[float, float, float]
+) -> None:
     """Floor, ceiling and four walls; the walls range from plain to patterned."""
     w, d, h = size
     floor = p.add("planks", (0.5, 0.36, 0.22), (0.28, 0.18, 0.1), 0.14, 0.15, 40)
     if rng.random() < 0.4:
         floor = p.add("tiles", (0.3, 0.3, 0.3), (0.55, 0.53, 0.5), 0.4, 0.2, 40)
     tint = np.array(WHITE) * rng.uniform(0.85, 1.0, 3)
-    papers = [p.matt_white, p.add("cloud", tint, 0.86 * tint, 0.5), p.add("stripes", tint, 0.8 * tint, 0.3)]
+    papers = [
+        p.matt_white,
+        p.add("cloud", tint, 0.86 * tint, 0.5),
+        p.add("stripes", tint, 0.8 * tint, 0.3),
+    ]
     room = Frame((0.0, 0.0, 0.0))
     b.box("floor", floor, room, (-0.1, -0.1, -0.1), (w + 0.1, d + 0.1, 0))
     ceiling = p.add("cloud", WHITE, tuple(0.9 * v for v in WHITE), 0.9)
@@ -101,7 +112,12 @@ def build(preset: str, seed: int) -> Room:
     shell(b, p, rng, size)
     {"office": office, "room": living_room, "toy": toy}[preset](b, p, rng, size)
     w, d, h = size
-    lights = np.array([[[w * 0.35, d * 0.5, h - 0.05], [0.5, 0.3, 0]], [[w * 0.75, d * 0.45, h - 0.05], [0.3, 0.5, 0]]])
+    lights = np.array(
+        [
+            [[w * 0.35, d * 0.5, h - 0.05], [0.5, 0.3, 0]],
+            [[w * 0.75, d * 0.45, h - 0.05], [0.3, 0.5, 0]],
+        ]
+    )
     return Room(b.soup(), p.table, lights, size)
 
 
@@ -122,7 +138,9 @@ def east(w: float, d: float, y: float, z: float = 0.0) -> Frame:
     return Frame((w, y, z), np.pi / 2)
 
 
-def office(b: Builder, p: Palette, rng: np.random.Generator, size: tuple[float, float, float]) -> None:
+def office(
+    b: Builder, p: Palette, rng: np.random.Generator, size: tuple[float, float, float]
+) -> None:
     w, d, _ = size
     x = w * 0.3 + rng.uniform(-0.1, 0.1)
     workplace(b, p, rng, south(w, d, x))
@@ -133,11 +151,15 @@ def office(b: Builder, p: Palette, rng: np.random.Generator, size: tuple[float, 
     put.plant(b, east(w, d, d * 0.28), p.add("plain", (0.45, 0.2, 0.12)), p.green, rng)
     seat = north(w, d, w * 0.55 + rng.uniform(-0.1, 0.1))
     put.sofa(b, seat, p.fabric, (p.other_fabric, p.add("dots", *p.two_tones(0.4), 0.1)))
-    put.picture(b, seat.moved(0, 0, 1.55), p.wood, p.add("painting", *p.two_tones(0.4), 0.25), 0.9, 0.6)
+    put.picture(
+        b, seat.moved(0, 0, 1.55), p.wood, p.add("painting", *p.two_tones(0.4), 0.25), 0.9, 0.6
+    )
     put.clock(b, north(w, d, w * 0.86, 1.75), p.metal, p.matt_white, p.dark)
     put.floor_lamp(b, north(w, d, w * 0.26).moved(0, 0.3, 0), p.metal, p.matt_white)
     put.door(b, west(w, d, d * 0.7), p.pale_wood, p.white)
-    put.picture(b, west(w, d, d * 0.3, 1.5), p.dark, p.add("painting", *p.two_tones(0.4), 0.2), 0.5, 0.65)
+    put.picture(
+        b, west(w, d, d * 0.3, 1.5), p.dark, p.add("painting", *p.two_tones(0.4), 0.2), 0.5, 0.65
+    )
     meeting(b, p, rng, Frame((w * 0.56, d * 0.47, 0), rng.uniform(-0.2, 0.2)))
 
 
@@ -161,12 +183,18 @@ def meeting(b: Builder, p: Palette, rng: np.random.Generator, f: Frame) -> None:
     put.lying_books(b, f.moved(0.2, 0.0, 0.72), p.books, rng)
 
 
-def living_room(b: Builder, p: Palette, rng: np.random.Generator, size: tuple[float, float, float]) -> None:
+def living_room(
+    b: Builder, p: Palette, rng: np.random.Generator, size: tuple[float, float, float]
+) -> None:
     w, d, _ = size
     seat = north(w, d, w * 0.45)
     put.sofa(b, seat, p.fabric, (p.other_fabric, p.add("dots", *p.two_tones(0.4), 0.1)), 2.1)
-    put.picture(b, seat.moved(-0.5, 0, 1.6), p.dark, p.add("painting", *p.two_tones(0.4), 0.25), 0.6, 0.6)
-    put.picture(b, seat.moved(0.4, 0, 1.6), p.wood, p.add("painting", *p.two_tones(0.4), 0.18), 0.8, 0.5)
+    put.picture(
+        b, seat.moved(-0.5, 0, 1.6), p.dark, p.add("painting", *p.two_tones(0.4), 0.25), 0.6, 0.6
+    )
+    put.picture(
+        b, seat.moved(0.4, 0, 1.6), p.wood, p.add("painting", *p.two_tones(0.4), 0.18), 0.8, 0.5
+    )
     put.floor_lamp(b, north(w, d, w * 0.8).moved(0, 0.3, 0), p.metal, p.matt_white)
     put.cabinet(b, south(w, d, w * 0.42), p.wood, p.metal, 1.6, 0.6)
     put.monitor(b, south(w, d, w * 0.42, 0.6), p.dark, p.screen, 0.95)
@@ -186,6 +214,8 @@ def toy(b: Builder, p: Palette, rng: np.random.Generator, size: tuple[float, flo
     w, d, _ = size
     put.cabinet(b, south(w, d, w * 0.3), p.pale_wood, p.metal, 1.0, 0.9)
     put.floor_lamp(b, south(w, d, w * 0.75).moved(0, 0.3, 0), p.metal, p.matt_white)
-    put.picture(b, north(w, d, w * 0.5, 1.5), p.wood, p.add("painting", *p.two_tones(0.4), 0.25), 1.0, 0.7)
+    put.picture(
+        b, north(w, d, w * 0.5, 1.5), p.wood, p.add("painting", *p.two_tones(0.4), 0.25), 1.0, 0.7
+    )
     put.chair(b, Frame((w * 0.55, d * 0.75, 0), np.pi), p.wood, p.other_fabric)
     put.table(b, Frame((w * 0.5, d * 0.4, 0)), p.wood, 0.9, 0.5, 0.6)

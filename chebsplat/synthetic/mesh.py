@@ -1,4 +1,6 @@
-"""A triangle soup with a label, a material and a texture frame for every triangle, built from simple solids."""
+"""A triangle soup with a label, a material and a texture frame for every triangle, built from
+simple solids.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +31,11 @@ class Frame:
 
 @dataclass
 class Soup:
-    """vertices f32 [N, 3] m, triangles u32 [T, 3]; by triangle: labels i16, materials i16, parts i32.
+    """vertices f32 [N, 3] m, triangles u32 [T, 3]; by triangle: labels i16, materials i16, parts
+    i32.
 
-    A part's texture coordinates are `rotations[part] @ (p − origins[part])`, with its longest side along x.
+    A part's texture coordinates are `rotations[part] @ (p − origins[part])`, with its longest side
+    along x.
     """
 
     vertices: np.ndarray
@@ -49,11 +53,14 @@ class Builder:
 
     vertices: list[np.ndarray] = field(default_factory=list)
     triangles: list[np.ndarray] = field(default_factory=list)
-    tags: list[tuple[int, int, int]] = field(default_factory=list)  # label, material, number of triangles
+    # label, material, number of triangles
+    tags: list[tuple[int, int, int]] = field(default_factory=list)
     frames: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
     count: int = 0
 
-    def add(self, label: str, material: int, frame: Frame, vertices: np.ndarray, triangles: np.ndarray) -> None:
+    def add(
+        self, label: str, material: int, frame: Frame, vertices: np.ndarray, triangles: np.ndarray
+    ) -> None:
         """One solid, in the local coordinates of `frame`."""
         rotation, origin = frame.rotation, np.asarray(frame.origin)
         centre = 0.5 * (vertices.min(0) + vertices.max(0))
@@ -65,7 +72,12 @@ class Builder:
         self.count += len(vertices)
 
     def box(
-        self, label: str, material: int, frame: Frame, low: tuple[float, float, float], high: tuple[float, float, float]
+        self,
+        label: str,
+        material: int,
+        frame: Frame,
+        low: tuple[float, float, float],
+        high: tuple[float, float, float],
     ) -> None:
         """An axis-aligned box between two local corners."""
         corners = np.array([low, high], float)
@@ -76,11 +88,20 @@ class Builder:
         self.add(label, material, frame, vertices, triangles)
 
     def revolved(
-        self, label: str, material: int, frame: Frame, profile: list[tuple[float, float]], n: int = 20
+        self,
+        label: str,
+        material: int,
+        frame: Frame,
+        profile: list[tuple[float, float]],
+        n: int = 20,
     ) -> None:
-        """A surface of revolution about the local z axis through (radius, height) points, closed at the ends."""
+        """A surface of revolution about the local z axis through (radius, height) points, closed at
+        the ends.
+        """
         angles = np.arange(n) * (2 * np.pi / n)
-        rings = [np.stack([r * np.cos(angles), r * np.sin(angles), np.full(n, z)], 1) for r, z in profile]
+        rings = [
+            np.stack([r * np.cos(angles), r * np.sin(angles), np.full(n, z)], 1) for r, z in profile
+        ]
         ends = np.array([[0, 0, profile[0][1]], [0, 0, profile[-1][1]]], float)
         vertices = np.concatenate([*rings, ends])
         triangles = []
@@ -93,28 +114,53 @@ class Builder:
             triangles += [(last, (i + 1) % n, i), (last + 1, last - n + i, last - n + (i + 1) % n)]
         self.add(label, material, frame, vertices, np.array(triangles))
 
-    def pillow(self, label: str, material: int, frame: Frame, size: tuple[float, float, float], n: int = 10) -> None:
+    def pillow(
+        self, label: str, material: int, frame: Frame, size: tuple[float, float, float], n: int = 10
+    ) -> None:
         """A cushion: a rounded square that swells in the middle, standing on its local z = 0."""
         grid = np.linspace(-1, 1, n)
         u, v = np.meshgrid(grid, grid, indexing="ij")
         swell = ((1 - u**2) * (1 - v**2)) ** 0.35
-        front = np.stack([u * size[0] / 2, swell * size[1] / 2, (v + 1) * size[2] / 2], -1).reshape(-1, 3)
+        front = np.stack([u * size[0] / 2, swell * size[1] / 2, (v + 1) * size[2] / 2], -1).reshape(
+            -1, 3
+        )
         back = front * (1, -1, 1)
         i, j = np.meshgrid(np.arange(n - 1), np.arange(n - 1), indexing="ij")
         a = (i * n + j).ravel()
-        faces = np.concatenate([np.stack([a, a + 1, a + n], 1), np.stack([a + 1, a + n + 1, a + n], 1)])
-        self.add(label, material, frame, np.concatenate([front, back]), np.concatenate([faces, faces[:, ::-1] + n * n]))
+        faces = np.concatenate(
+            [np.stack([a, a + 1, a + n], 1), np.stack([a + 1, a + n + 1, a + n], 1)]
+        )
+        self.add(
+            label,
+            material,
+            frame,
+            np.concatenate([front, back]),
+            np.concatenate([faces, faces[:, ::-1] + n * n]),
+        )
 
     def leaf(
-        self, label: str, material: int, frame: Frame, length: float, reach: float, width: float, bend: float
+        self,
+        label: str,
+        material: int,
+        frame: Frame,
+        length: float,
+        reach: float,
+        width: float,
+        bend: float,
     ) -> None:
         """A bent, pointed blade that grows from the local origin up, and by `reach` (m) along y."""
         t = np.linspace(0, 1, 6)
-        spine = np.stack([np.zeros(6), reach * t * (1.5 - 0.5 * t), length * t * (1 - 0.6 * bend * t)], 1)
-        half = np.stack([0.5 * width * np.sin(np.pi * np.clip(t, 0.04, 1)), np.zeros(6), np.zeros(6)], 1)
+        spine = np.stack(
+            [np.zeros(6), reach * t * (1.5 - 0.5 * t), length * t * (1 - 0.6 * bend * t)], 1
+        )
+        half = np.stack(
+            [0.5 * width * np.sin(np.pi * np.clip(t, 0.04, 1)), np.zeros(6), np.zeros(6)], 1
+        )
         vertices = np.concatenate([spine - half, spine + half])
         a = np.arange(5)
-        triangles = np.concatenate([np.stack([a, a + 1, a + 6], 1), np.stack([a + 1, a + 7, a + 6], 1)])
+        triangles = np.concatenate(
+            [np.stack([a, a + 1, a + 6], 1), np.stack([a + 1, a + 7, a + 6], 1)]
+        )
         self.add(label, material, frame, vertices, triangles)
 
     def soup(self) -> Soup:

@@ -17,7 +17,8 @@ def open3d() -> Any:
     """The module, loaded when it is first asked for.
 
     Raises: ConfigError, with the remedy, where it or a library that it is linked to is missing.
-    Choices: libusb, which few machines have, is loaded first, from libusb-package: open3d's loader finds it by name.
+    Choices: libusb, which few machines have, is loaded first, from libusb-package: open3d's loader
+      finds it by name.
     """
     with suppress(ImportError, OSError):  # the system may have one
         import libusb_package
@@ -26,13 +27,18 @@ def open3d() -> Any:
     try:
         import open3d as module
     except (ImportError, OSError) as error:
-        remedy = "pip install open3d-cpu libusb-package; Debian, Ubuntu: apt install libegl1 libgl1 libgomp1"
+        remedy = (
+            "pip install open3d-cpu libusb-package; Debian, Ubuntu: apt install libegl1 "
+            "libgl1 libgomp1"
+        )
         raise ConfigError(f"open3d cannot be imported: {error} ({remedy})") from error
     return module
 
 
 class Hits(NamedTuple):
-    """distance f32 [N] along the ray (inf: none), triangle i64 [N] (-1: none), normals f32 [N, 3] of unit length."""
+    """distance f32 [N] along the ray (inf: none), triangle i64 [N] (-1: none), normals f32 [N, 3]
+    of unit length.
+    """
 
     distance: np.ndarray
     triangle: np.ndarray
@@ -45,7 +51,9 @@ class RayCaster:
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
         self._open3d = open3d()
         self._scene: Any = self._open3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(self._tensor(vertices, np.float32), self._tensor(triangles, np.uint32))
+        self._scene.add_triangles(
+            self._tensor(vertices, np.float32), self._tensor(triangles, np.uint32)
+        )
         self._none = self._scene.INVALID_ID
 
     def cast(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
@@ -59,18 +67,24 @@ class RayCaster:
 
     def is_blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Bool [N]: something lies within one length of the direction."""
-        blocked: np.ndarray = self._scene.test_occlusions(self._rays(origins, directions), 0.0, 1.0).numpy()
+        blocked: np.ndarray = self._scene.test_occlusions(
+            self._rays(origins, directions), 0.0, 1.0
+        ).numpy()
         return blocked
 
     def _rays(self, origins: np.ndarray, directions: np.ndarray) -> Any:
-        return self._tensor(np.concatenate(np.broadcast_arrays(origins, directions), -1), np.float32)
+        return self._tensor(
+            np.concatenate(np.broadcast_arrays(origins, directions), -1), np.float32
+        )
 
     def _tensor(self, array: np.ndarray, dtype: Any) -> Any:
         return self._open3d.core.Tensor(np.ascontiguousarray(array, dtype))
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """cam_from_world [4, 4] of a camera at `eye` that looks at `target`, OpenCV axes, world z up."""
+    """cam_from_world [4, 4] of a camera at `eye` that looks at `target`, OpenCV axes, world z
+    up.
+    """
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -83,11 +97,13 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 def walk(size: tuple[float, float, float], n_views: int, seed: int) -> np.ndarray:
     """Poses [V, 4, 4] cam_from_world along the path.
 
-    Choices: two rounds, the second lower, closer and turned the other way; the gaze crosses the room, swings by ±49°
-      and nods twice a round between 26° down and 4° up, so every surface is met from several sides. Few views make
-      one round with half the swing and one nod: neighbours would share too little otherwise. No eye is below 1.47 m,
-      which clears the chairs (1.05 m at most) by 0.4 m; what is taller stands at a wall. In 200 shuffled rooms nothing
-      comes nearer than 0.38 m.
+    Choices: two rounds, the second lower, closer and turned the other way; the gaze crosses the
+      room, swings by ±49° and nods twice a round between 26° down and 4° up, so every surface is
+      met from several sides. Few views make
+      one round with half the swing and one nod: neighbours would share too little otherwise. No eye
+        is below 1.47 m,
+      which clears the chairs (1.05 m at most) by 0.4 m; what is taller stands at a wall. In 200
+      shuffled rooms nothing comes nearer than 0.38 m.
     """
     rng = np.random.default_rng([seed, 1])
     phase = rng.uniform(0, 2 * np.pi)
@@ -99,10 +115,18 @@ def walk(size: tuple[float, float, float], n_views: int, seed: int) -> np.ndarra
         round_, angle = int(t), 2 * np.pi * t + phase
         radius = (0.27, 0.25) if round_ == 0 else (0.20, 0.17)
         height = (1.62 if round_ == 0 else 1.52) + 0.05 * np.sin(3 * angle)
-        eye = np.array([width * (0.5 + radius[0] * np.cos(angle)), depth * (0.5 + radius[1] * np.sin(angle)), height])
+        eye = np.array(
+            [
+                width * (0.5 + radius[0] * np.cos(angle)),
+                depth * (0.5 + radius[1] * np.sin(angle)),
+                height,
+            ]
+        )
         gaze = angle + np.pi + (swing if round_ == 0 else -swing) * np.sin(angle + phase)
         pitch = np.deg2rad(-11 + 15 * np.sin(rounds * angle))
-        direction = np.array([np.cos(gaze) * np.cos(pitch), np.sin(gaze) * np.cos(pitch), np.sin(pitch)])
+        direction = np.array(
+            [np.cos(gaze) * np.cos(pitch), np.sin(gaze) * np.cos(pitch), np.sin(pitch)]
+        )
         poses.append(look_at(eye, eye + direction))
     return np.stack(poses)
 

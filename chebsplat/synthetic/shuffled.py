@@ -1,6 +1,7 @@
 """Rooms furnished at random, with other materials and light: no two of them share a layout.
 
-Choices: pieces stand in any order along the walls, with a gap between them; what a room holds follows its size.
+Choices: pieces stand in any order along the walls, with a gap between them; what a room holds
+  follows its size.
 """
 
 from __future__ import annotations
@@ -18,17 +19,27 @@ Generator = np.random.Generator
 
 
 def jitter(room: layout.Room, rng: Generator) -> None:
-    """Give half of the room's materials other colours, some of them another pattern too, and move its lights."""
+    """Give half of the room's materials other colours, some of them another pattern too, and move
+    its lights.
+    """
     patterns = ["plain", *PATTERNS]
     for index, material in enumerate(room.materials):
         if rng.random() < 0.5:
-            tone = np.clip(rng.uniform(0.02, 0.95) * (1 + rng.uniform(-0.5, 0.5, 3) * rng.random()), 0.02, 0.9)
+            tone = np.clip(
+                rng.uniform(0.02, 0.95) * (1 + rng.uniform(-0.5, 0.5, 3) * rng.random()), 0.02, 0.9
+            )
             other = np.clip(tone * rng.uniform(0.4, 1.2, 3), 0.01, 0.9)
             first, second = ((float(c[0]), float(c[1]), float(c[2])) for c in (tone, other))
-            material = replace(material, first=first, second=second, gloss=material.gloss * rng.uniform(0, 1.5))
+            material = replace(
+                material, first=first, second=second, gloss=material.gloss * rng.uniform(0, 1.5)
+            )
         if rng.random() < 0.25:
             pattern = str(rng.choice(patterns))
-            material = replace(material, pattern=pattern, scale=float(np.exp(rng.uniform(np.log(0.05), np.log(0.7)))))
+            material = replace(
+                material,
+                pattern=pattern,
+                scale=float(np.exp(rng.uniform(np.log(0.05), np.log(0.7)))),
+            )
         room.materials[index] = material
     room.lights[:, 0, :2] += rng.uniform(-0.6, 0.6, (len(room.lights), 2))
     if rng.random() < 0.25:
@@ -50,9 +61,14 @@ def shuffled(seed: int) -> layout.Room:
                 piece(b, p, rng, wall(w, d, at + width / 2), width)
                 at += width + rng.uniform(0.05, 0.4)
     if min(w, d) > 3.9:
-        middle = Frame((w * rng.uniform(0.45, 0.55), d * rng.uniform(0.45, 0.55), 0), rng.uniform(-np.pi, np.pi))
+        middle = Frame(
+            (w * rng.uniform(0.45, 0.55), d * rng.uniform(0.45, 0.55), 0),
+            rng.uniform(-np.pi, np.pi),
+        )
         layout.meeting(b, p, rng, middle)
-    centres = np.stack([rng.uniform(0.2, 0.8, 2) * w, rng.uniform(0.3, 0.7, 2) * d, np.full(2, h - 0.05)], 1)
+    centres = np.stack(
+        [rng.uniform(0.2, 0.8, 2) * w, rng.uniform(0.3, 0.7, 2) * d, np.full(2, h - 0.05)], 1
+    )
     halves = np.concatenate([rng.uniform(0.2, 0.6, (2, 2)), np.zeros((2, 1))], 1)
     return layout.Room(b.soup(), p.table, np.stack([centres, halves], 1), size)
 
@@ -82,7 +98,12 @@ def _upon(b: Builder, p: layout.Palette, rng: Generator, f: Frame, width: float)
             case 1:
                 put.keyboard(b, spot.moved(0, 0.1, 0), p.keys)
             case 2:
-                put.desk_lamp(b, spot.moved(0, 0.12, 0), p.metal, int(rng.choice([p.matt_white, p.other_fabric])))
+                put.desk_lamp(
+                    b,
+                    spot.moved(0, 0.12, 0),
+                    p.metal,
+                    int(rng.choice([p.matt_white, p.other_fabric])),
+                )
             case 3:
                 put.lying_books(b, spot.moved(0, 0.15, 0), p.books, rng)
             case 4:
@@ -108,7 +129,12 @@ def _desk(b: Builder, p: layout.Palette, rng: Generator, f: Frame, width: float)
         return
     put.desk(b, f, _any(p, rng), p.metal, width, 0.6)
     _upon(b, p, rng, f.moved(0, 0, 0.74), width)
-    put.office_chair(b, f.moved(rng.uniform(-0.2, 0.2), 1.25, 0, np.pi + rng.uniform(-0.6, 0.6)), p.metal, p.fabric)
+    put.office_chair(
+        b,
+        f.moved(rng.uniform(-0.2, 0.2), 1.25, 0, np.pi + rng.uniform(-0.6, 0.6)),
+        p.metal,
+        p.fabric,
+    )
 
 
 def _table(b: Builder, p: layout.Palette, rng: Generator, f: Frame, width: float) -> None:
@@ -138,7 +164,9 @@ def _small(b: Builder, p: layout.Palette, rng: Generator, f: Frame, width: float
     """A lamp, plant, bin or chair at the wall."""
     match int(rng.integers(4)):
         case 0:
-            put.floor_lamp(b, f.moved(0, 0.25, 0), p.metal, int(rng.choice([p.matt_white, p.other_fabric])))
+            put.floor_lamp(
+                b, f.moved(0, 0.25, 0), p.metal, int(rng.choice([p.matt_white, p.other_fabric]))
+            )
         case 1:
             put.plant(b, f, _any(p, rng), p.green, rng, rng.uniform(0.5, 1.1))
         case 2:
@@ -155,5 +183,7 @@ PIECES = (
 
 
 def build(preset: str, seed: int) -> layout.Room:
-    """The room of a preset (`office`, `room`, `toy`, `shuffled`) and a seed. Raises KeyError on another preset."""
+    """The room of a preset (`office`, `room`, `toy`, `shuffled`) and a seed. Raises KeyError on
+    another preset.
+    """
     return shuffled(seed) if preset == "shuffled" else layout.build(preset, seed)

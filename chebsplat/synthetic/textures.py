@@ -1,6 +1,7 @@
 """Solid textures: colour of a point from its texture coordinates, smooth at the scale of a pixel.
 
-Its shade: ambient light, two ceiling panels with soft shadows, and a highlight that moves with the eye.
+Its shade: ambient light, two ceiling panels with soft shadows, and a highlight that moves with the
+  eye.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-SAMPLES = ((-0.7, -0.6), (0.6, -0.7), (0.7, 0.6), (-0.6, 0.7))  # points of a panel that light is taken from
+# points of a panel that light is taken from
+SAMPLES = ((-0.7, -0.6), (0.6, -0.7), (0.7, 0.6), (-0.6, 0.7))
 
 
 @dataclass(frozen=True)
 class Material:
-    """Pattern between two linear colours; `scale` is the pattern's period in metres, `gloss` the height of the
-    highlight and `shininess` its exponent; `seed` decorrelates noise.
+    """Pattern between two linear colours; `scale` is the pattern's period in metres, `gloss` the
+    height of the highlight and `shininess` its exponent; `seed` decorrelates noise.
     """
 
     pattern: str
@@ -38,8 +40,14 @@ def noise(points: np.ndarray, seed: int) -> np.ndarray:
     total = np.zeros(len(points), np.float32)
     for corner in range(8):
         x, y, z = corner & 1, corner >> 1 & 1, corner >> 2
-        weight = (f[:, 0] if x else 1 - f[:, 0]) * (f[:, 1] if y else 1 - f[:, 1]) * (f[:, 2] if z else 1 - f[:, 2])
-        total += weight * _hashed(i[:, 0] + np.uint32(x), i[:, 1] + np.uint32(y), i[:, 2] + np.uint32(z), seed)
+        weight = (
+            (f[:, 0] if x else 1 - f[:, 0])
+            * (f[:, 1] if y else 1 - f[:, 1])
+            * (f[:, 2] if z else 1 - f[:, 2])
+        )
+        total += weight * _hashed(
+            i[:, 0] + np.uint32(x), i[:, 1] + np.uint32(y), i[:, 2] + np.uint32(z), seed
+        )
     return total
 
 
@@ -59,7 +67,9 @@ def _edge(x: np.ndarray, softness: float) -> np.ndarray:
 
 def _wood(p: np.ndarray, m: Material) -> np.ndarray:
     stretched = p / m.scale * (0.25, 1.0, 1.0)
-    return 0.5 + 0.5 * np.sin(2 * np.pi * (stretched[:, 1] + stretched[:, 2] + 1.6 * noise(stretched, m.seed)))
+    return 0.5 + 0.5 * np.sin(
+        2 * np.pi * (stretched[:, 1] + stretched[:, 2] + 1.6 * noise(stretched, m.seed))
+    )
 
 
 def _planks(p: np.ndarray, m: Material) -> np.ndarray:
@@ -77,7 +87,9 @@ def _tiles(p: np.ndarray, m: Material) -> np.ndarray:
 
 
 def _cloud(p: np.ndarray, m: Material) -> np.ndarray:
-    return np.clip(0.7 * noise(p / m.scale, m.seed) + 0.3 * noise(2.3 * p / m.scale, m.seed + 1), 0, 1)
+    return np.clip(
+        0.7 * noise(p / m.scale, m.seed) + 0.3 * noise(2.3 * p / m.scale, m.seed + 1), 0, 1
+    )
 
 
 def _stripes(p: np.ndarray, m: Material) -> np.ndarray:
@@ -129,7 +141,9 @@ def colors(points: np.ndarray, materials: np.ndarray, table: list[Material]) -> 
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Row by row a · b, [N, 1]; several times faster on rows of three than a sum over the last axis."""
+    """Row by row a · b, [N, 1]; several times faster on rows of three than a sum over the last
+    axis.
+    """
     products: np.ndarray = np.einsum("ni,ni->n", a, b)[:, None]
     return products
 
@@ -147,12 +161,16 @@ def shade(
     """Linear light [N, 3] that leaves surface points towards the eye.
 
     Args:
-      points, normals, to_eye: [N, 3], the latter two unit and on one side; albedo [N, 3]; gloss, shininess [N].
+      points, normals, to_eye: [N, 3], the latter two unit and on one side; albedo [N, 3]; gloss,
+        shininess [N].
       lights:     [L, 2, 3] centres and half extents of ceiling panels, metres.
       is_blocked: shadow test of segments, (origins [N, 3], offsets [N, 3]) -> bool [N].
     """
     ambient = (0.40 + 0.10 * normals[:, 2:]) * np.array((1.0, 0.99, 0.97), np.float32)
-    diffuse, highlight = np.zeros((len(points), 1), np.float32), np.zeros((len(points), 1), np.float32)
+    diffuse, highlight = (
+        np.zeros((len(points), 1), np.float32),
+        np.zeros((len(points), 1), np.float32),
+    )
     start = points + 2e-3 * normals
     for centre, half in lights:
         for u, v in SAMPLES:
@@ -165,7 +183,9 @@ def shade(
             diffuse += lit * facing * falloff
             middle = direction + to_eye
             middle /= np.sqrt(dot(middle, middle)).clip(1e-6)
-            highlight += lit * (facing > 0) * np.maximum(dot(normals, middle), 0) ** shininess[:, None]
+            highlight += (
+                lit * (facing > 0) * np.maximum(dot(normals, middle), 0) ** shininess[:, None]
+            )
     n = len(lights) * len(SAMPLES)
     return albedo * (ambient + 5.2 / len(SAMPLES) * 0.5 * diffuse) + gloss[:, None] * highlight / n
 
@@ -174,5 +194,7 @@ def tone_map(light: np.ndarray) -> np.ndarray:
     """Linear light to sRGB u8, the brightest parts rolled off."""
     exposed = 0.95 * light
     rolled = np.where(exposed < 0.7, exposed, 0.7 + 0.3 * (1 - np.exp(-(exposed - 0.7) / 0.3)))
-    encoded = np.where(rolled < 0.0031308, 12.92 * rolled, 1.055 * np.maximum(rolled, 1e-9) ** (1 / 2.4) - 0.055)
+    encoded = np.where(
+        rolled < 0.0031308, 12.92 * rolled, 1.055 * np.maximum(rolled, 1e-9) ** (1 / 2.4) - 0.055
+    )
     return np.round(255 * np.clip(encoded, 0, 1)).astype(np.uint8)

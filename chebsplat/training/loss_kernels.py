@@ -1,7 +1,9 @@
-"""Losses and their gradients in one sweep over the image, in numba, float32: L1 and SSIM; distance of features.
+"""Losses and their gradients in one sweep over the image, in numba, float32: L1 and SSIM; distance
+of features.
 
-Images are [H, W, 3] seen as rows of W · 3 values, so a tap of the horizontal window is a shift by 3. Rows are
-independent in each of four passes; no pass writes what another thread writes, so the thread count changes no bit.
+Images are [H, W, 3] seen as rows of W · 3 values, so a tap of the horizontal window is a shift by
+3. Rows are independent in each of four passes; no pass writes what another thread writes, so the
+  thread count changes no bit.
 """
 
 from __future__ import annotations
@@ -16,7 +18,9 @@ WINDOW, SIGMA = 11, 1.5
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
 HALF = WINDOW // 2
 _x = np.arange(WINDOW) - HALF
-TAPS = (np.exp(-0.5 * (_x / SIGMA) ** 2) / np.exp(-0.5 * (_x / SIGMA) ** 2).sum()).astype(np.float32)
+TAPS = (np.exp(-0.5 * (_x / SIGMA) ** 2) / np.exp(-0.5 * (_x / SIGMA) ** 2).sum()).astype(
+    np.float32
+)
 TINY = np.float32(1e-12)
 
 
@@ -50,7 +54,9 @@ def _sum(terms):
 
 @kernel
 def _compare(blurred, weight):
-    """SSIM summed under a weight [H, L], by row, and its derivatives: to mean, variance and covariance, [H, 3, L]."""
+    """SSIM summed under a weight [H, L], by row, and its derivatives: to mean, variance and
+    covariance, [H, 3, L].
+    """
     height, _, length = blurred.shape
     values = np.zeros(height, np.float64)
     slopes = np.zeros((height, 3, length), np.float32)
@@ -72,7 +78,9 @@ def _compare(blurred, weight):
             terms[x] = w * value
             by_cov = np.float32(2) * top_1 * over * w
             by_var = -value / low_2 * w
-            by_mean = (np.float32(2) * mean_b * top_2 * over - np.float32(2) * mean_a * value / low_1) * w
+            by_mean = (
+                np.float32(2) * mean_b * top_2 * over - np.float32(2) * mean_a * value / low_1
+            ) * w
             slopes[y, 0, x] = by_mean - np.float32(2) * mean_a * by_var - mean_b * by_cov
             slopes[y, 1, x], slopes[y, 2, x] = by_var, by_cov
         values[y] = _sum(terms)
@@ -119,22 +127,29 @@ def _gather(slopes, a, b, weight, weight_ssim):
     return gradient, distance
 
 
-def photometric(a: np.ndarray, b: np.ndarray, weight: np.ndarray, weight_ssim: float) -> tuple[float, np.ndarray]:
+def photometric(
+    a: np.ndarray, b: np.ndarray, weight: np.ndarray, weight_ssim: float
+) -> tuple[float, np.ndarray]:
     """Loss (1 − w) L1 + w (Σ weight − SSIM) and its gradient [H, W, 3] to `a`.
 
-    Args: a, b [H, W, 3] float32 in [0, 1]; weight [H, W, 3] what each value counts, summing to 1 (or 0).
+    Args: a, b [H, W, 3] float32 in [0, 1]; weight [H, W, 3] what each value counts, summing to 1
+      (or 0).
     """
     shape = a.shape
     a, b, weight = (np.ascontiguousarray(v.reshape(shape[0], -1)) for v in (a, b, weight))
     values, slopes = _compare(_blur_products(a, b), weight)
     gradient, distance = _gather(_blur_rows(slopes), a, b, weight, np.float32(weight_ssim))
-    loss = (1 - weight_ssim) * distance.sum() + weight_ssim * (weight.sum(dtype=np.float64) - values.sum())
+    loss = (1 - weight_ssim) * distance.sum() + weight_ssim * (
+        weight.sum(dtype=np.float64) - values.sum()
+    )
     return float(loss), gradient.reshape(shape)
 
 
 @inline
 def _span(i, n, size):
-    """Pixels [start, stop) of cell i of n, as adaptive pooling cuts them: neighbours may share one."""
+    """Pixels [start, stop) of cell i of n, as adaptive pooling cuts them: neighbours may share
+    one.
+    """
     return i * size // n, ((i + 1) * size + n - 1) // n
 
 
@@ -144,7 +159,8 @@ def feature_distance(render, target, share, by_channel):
 
     The distance is mean_c |pooled − target| by channel, else √(mean_c (pooled − target)²).
 
-    Args: render [H, W, C], target [h, w, C], share [h, w] what each cell counts, float32; by_channel bool.
+    Args: render [H, W, C], target [h, w, C], share [h, w] what each cell counts, float32;
+      by_channel bool.
     Returns: values [h] float64; gradient [H, W, C].
     """
     height, width, channels = render.shape
@@ -167,7 +183,9 @@ def feature_distance(render, target, share, by_channel):
                 mean[c] = mean[c] / area - target[i, j, c]
                 total += abs(mean[c]) if by_channel else mean[c] * mean[c]
             distance = (
-                total / np.float32(channels) if by_channel else np.float32(math.sqrt(total / np.float32(channels)))
+                total / np.float32(channels)
+                if by_channel
+                else np.float32(math.sqrt(total / np.float32(channels)))
             )
             scale = share[i, j] / (area * np.float32(channels))
             for c in range(channels):

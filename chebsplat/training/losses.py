@@ -28,9 +28,9 @@ def _blur(images: Tensor) -> Tensor:
     taps = _taps(images.dtype, images.device)
     planes = images.permute(2, 0, 1)[:, None]
     planes = torch.nn.functional.conv2d(planes, taps[None, None, :, None], padding=(WINDOW // 2, 0))
-    return torch.nn.functional.conv2d(planes, taps[None, None, None, :], padding=(0, WINDOW // 2))[:, 0].permute(
-        1, 2, 0
-    )
+    return torch.nn.functional.conv2d(planes, taps[None, None, None, :], padding=(0, WINDOW // 2))[
+        :, 0
+    ].permute(1, 2, 0)
 
 
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
@@ -38,7 +38,8 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
 
     Choices: Gaussian window 11, σ 1.5, zero padding, biased variances, as 3DGS.
     """
-    blurred = _blur(torch.cat([a, b, a * a, b * b, a * b], -1))  # at once: a GPU waits for launches, not for sums
+    # at once: a GPU waits for launches, not for sums
+    blurred = _blur(torch.cat([a, b, a * a, b * b, a * b], -1))
     mean_a, mean_b, square_a, square_b, product = blurred.split(a.shape[-1], -1)
     var_a, var_b, covariance = square_a - mean_a**2, square_b - mean_b**2, product - mean_a * mean_b
     top = (2 * mean_a * mean_b + float(C1)) * (2 * covariance + float(C2))
@@ -49,15 +50,21 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
     """Mean SSIM of two u8 images [H, W, 3]."""
     if a.dtype != np.uint8 or b.dtype != np.uint8 or a.shape != b.shape:
-        raise ValueError(f"two u8 images of one shape are needed, not {a.dtype} {a.shape}, {b.dtype} {b.shape}")
-    return float(ssim_map(torch.from_numpy(a).double() / 255, torch.from_numpy(b).double() / 255).mean())
+        raise ValueError(
+            f"two u8 images of one shape are needed, not {a.dtype} {a.shape}, {b.dtype} {b.shape}"
+        )
+    return float(
+        ssim_map(torch.from_numpy(a).double() / 255, torch.from_numpy(b).double() / 255).mean()
+    )
 
 
 class _Photometric(torch.autograd.Function):
     """The fused loss: its gradient is computed with its value."""
 
     @staticmethod
-    def forward(ctx: Any, render: Tensor, target: Tensor, weight: Tensor, weight_ssim: float) -> Tensor:
+    def forward(
+        ctx: Any, render: Tensor, target: Tensor, weight: Tensor, weight_ssim: float
+    ) -> Tensor:
         from chebsplat.training.loss_kernels import photometric
 
         a, b, w = (t.detach().numpy() for t in (render, target, weight))
@@ -76,10 +83,10 @@ def photometric(
 ) -> Tensor:
     """(1 − w) L1 + w (1 − SSIM) over the pixels that count.
 
-    Args: render, target [H, W, 3] in [0, 1]; mask [H, W] bool, true where a pixel counts, or float ≥ 0, how much it
-      does; None: all alike; backend: of `rasterize`.
-    Choices: pixels that do not count take the target's colour first, so they have no gradient, not even through
-      SSIM's window. 0 where nothing counts.
+    Args: render, target [H, W, 3] in [0, 1]; mask [H, W] bool, true where a pixel counts, or float
+      ≥ 0, how much it does; None: all alike; backend: of `rasterize`.
+    Choices: pixels that do not count take the target's colour first, so they have no gradient, not
+      even through SSIM's window. 0 where nothing counts.
     """
     if not is_compiled(render, backend):
         return photometric_reference(render, target, mask, weight_ssim)
@@ -93,20 +100,33 @@ def photometric(
     return loss
 
 
-def photometric_reference(render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float) -> Tensor:
-    """As `photometric`, in plain torch, of any float type on any device: twin and oracle of the fused loss."""
+def photometric_reference(
+    render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float
+) -> Tensor:
+    """As `photometric`, in plain torch, of any float type on any device: twin and oracle of the
+    fused loss.
+    """
     counted = torch.ones_like(target[..., 0]) if mask is None else mask.to(target.dtype)
     render = torch.where(counted[..., None] > 0, render, target)
-    weight = counted[..., None].expand_as(target) / (counted.sum() * target.shape[-1]).clamp_min(1e-6)
+    weight = counted[..., None].expand_as(target) / (counted.sum() * target.shape[-1]).clamp_min(
+        1e-6
+    )
     distance = (weight * (render - target).abs()).sum()
-    return (1 - weight_ssim) * distance + weight_ssim * (weight * (1 - ssim_map(render, target))).sum()
+    return (1 - weight_ssim) * distance + weight_ssim * (
+        weight * (1 - ssim_map(render, target))
+    ).sum()
 
 
-def depth_distance(inverse_depth: Tensor, alpha: Tensor, truth: Tensor, mask: Tensor | None) -> Tensor:
-    """How far rendered surfaces lie from measured ones, relative to their depth: mean |Σ wᵢ (d / zᵢ − 1)|.
+def depth_distance(
+    inverse_depth: Tensor, alpha: Tensor, truth: Tensor, mask: Tensor | None
+) -> Tensor:
+    """How far rendered surfaces lie from measured ones, relative to their depth: mean |Σ wᵢ (d / zᵢ
+    − 1)|.
 
-    Args: inverse_depth [H, W] Σ wᵢ / zᵢ, alpha [H, W, 1] Σ wᵢ; truth d [H, W], nan where unknown; mask [H, W] or None.
-    Choices: no division by alpha, so that a pixel that little covers pulls little; 0 where nothing is known.
+    Args: inverse_depth [H, W] Σ wᵢ / zᵢ, alpha [H, W, 1] Σ wᵢ; truth d [H, W], nan where unknown;
+      mask [H, W] or None.
+    Choices: no division by alpha, so that a pixel that little covers pulls little; 0 where nothing
+      is known.
     """
     known = torch.isfinite(truth) & (truth > 0)
     if mask is not None:
@@ -120,7 +140,9 @@ class _FeatureDistance(torch.autograd.Function):
     """The fused loss: its gradient is computed with its value."""
 
     @staticmethod
-    def forward(ctx: Any, render: Tensor, target: Tensor, share: Tensor, by_channel: bool) -> Tensor:
+    def forward(
+        ctx: Any, render: Tensor, target: Tensor, share: Tensor, by_channel: bool
+    ) -> Tensor:
         from chebsplat.training.loss_kernels import feature_distance
 
         arrays = (t.detach().contiguous().numpy() for t in (render, target, share))
@@ -134,9 +156,11 @@ class _FeatureDistance(torch.autograd.Function):
         return grad * gradient, None, None, None
 
 
-def cell_shares(mask: Tensor | None, size: tuple[int, int], like: Tensor, counted: Tensor | None = None) -> Tensor:
-    """What each cell of the target counts, [h, w], summing to 1 (or 0): the mean of its pixels' mask [H, W], and
-    nothing where `counted` [h, w] is false. Of the type and device of `like`.
+def cell_shares(
+    mask: Tensor | None, size: tuple[int, int], like: Tensor, counted: Tensor | None = None
+) -> Tensor:
+    """What each cell of the target counts, [h, w], summing to 1 (or 0): the mean of its pixels'
+    mask [H, W], and nothing where `counted` [h, w] is false. Of the type and device of `like`.
     """
     if mask is None:
         share = like.new_full(size, 1 / (size[0] * size[1]))
@@ -157,12 +181,15 @@ def feature_distance(
 ) -> Tensor:
     """Mean distance to the teacher's features at the teacher's resolution.
 
-    Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts, or float ≥ 0, how
-      much it does. kind: `length` of the difference over √C, or `l1`, its mean magnitude by channel; counted [h, w]
+    Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts, or
+      float ≥ 0, how
+      much it does. kind: `length` of the difference over √C, or `l1`, its mean magnitude by
+        channel; counted [h, w]
       bool: cells of the target that say something, None: all do; backend: of `rasterize`.
-    Choices: the render is averaged over each cell of the target; a cell counts by the mean of its pixels' mask.
-      Where views disagree about a Gaussian the shortest total length is at their geometric median, which lies near the
-      most common vector; the median channel by channel, where L1 is least, may be near none of them.
+    Choices: the render is averaged over each cell of the target; a cell counts by the mean of its
+      pixels' mask. Where views disagree about a Gaussian the shortest total length is at their
+      geometric median, which lies near the most common vector; the median channel by channel, where
+      L1 is least, may be near none of them.
     """
     if not is_compiled(render, backend):
         return feature_distance_reference(render, target.to(render.dtype), mask, kind, counted)
@@ -178,12 +205,19 @@ def feature_distance_reference(
     kind: str = "length",
     counted: Tensor | None = None,
 ) -> Tensor:
-    """As `feature_distance`, in plain torch, of any float type on any device: twin and oracle of the fused loss."""
+    """As `feature_distance`, in plain torch, of any float type on any device: twin and oracle of
+    the fused loss.
+    """
     size = (target.shape[0], target.shape[1])
     pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)
     share = cell_shares(mask, size, render, counted)
-    difference = torch.where(share[..., None] != 0, pooled - target, 0.0)  # what does not count may be anything
-    distance = difference.abs().mean(-1) if kind == "l1" else difference.square().mean(-1).clamp_min(1e-30).sqrt()
+    # what does not count may be anything
+    difference = torch.where(share[..., None] != 0, pooled - target, 0.0)
+    distance = (
+        difference.abs().mean(-1)
+        if kind == "l1"
+        else difference.square().mean(-1).clamp_min(1e-30).sqrt()
+    )
     return (distance * share).sum()
 
 
@@ -195,9 +229,11 @@ def semantic_loss(
     settings: TrainSection,
     backend: str = "auto",
 ) -> Tensor:
-    """What a view's rendered features [H, W, C] cost, by `train.feature_loss`; cells without a label cost nothing.
+    """What a view's rendered features [H, W, C] cost, by `train.feature_loss`; cells without a
+    label cost nothing.
 
-    Args: features [h, w, C] and labels of the teacher; mask [H, W], true where a pixel counts, or None;
+    Args: features [h, w, C] and labels of the teacher; mask [H, W], true where a pixel counts, or
+      None;
       backend: of `rasterize`.
     Raises: ValueError where cross-entropy is asked for without labels.
     """
@@ -206,22 +242,31 @@ def semantic_loss(
             raise ValueError("cross-entropy needs labels with a confidence")
         return label_entropy(render, labels, mask, TEMPERATURE)
     counted = None if labels is None or labels.complete else labels.classes >= 0
-    return feature_distance(render, features, mask, settings.feature_loss or "length", counted, backend)
+    return feature_distance(
+        render, features, mask, settings.feature_loss or "length", counted, backend
+    )
 
 
-def label_entropy(render: Tensor, labels: TaughtLabels, mask: Tensor | None, temperature: float) -> Tensor:
-    """Cross-entropy of labels on the logits render · class codes / temperature, weighted by confidence.
+def label_entropy(
+    render: Tensor, labels: TaughtLabels, mask: Tensor | None, temperature: float
+) -> Tensor:
+    """Cross-entropy of labels on the logits render · class codes / temperature, weighted by
+    confidence.
 
-    Args: render [H, W, C], as accumulated: a pixel that little covers has logits near 0; labels of h × w cells, h ≤ H;
-      mask [H, W], as of `feature_distance`.
+    Args: render [H, W, C], as accumulated: a pixel that little covers has logits near 0; labels of
+      h × w cells, h ≤ H; mask [H, W], as of `feature_distance`.
     Returns: the mean over cells that have a label, 0 where none has one.
-    Choices: the render is averaged over each cell, as in `feature_distance`. The mean is over cells, not over
-      confidences: a view of which the teacher is unsure teaches less than another, as in Panoptic Lifting.
+    Choices: the render is averaged over each cell, as in `feature_distance`. The mean is over
+      cells, not over
+      confidences: a view of which the teacher is unsure teaches less than another, as in Panoptic
+        Lifting.
     """
     size = (labels.classes.shape[0], labels.classes.shape[1])
     pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)
     logits = pooled @ labels.class_codes.to(render.dtype).T / temperature
-    log_likelihood = logits.log_softmax(-1).gather(-1, labels.classes.clamp_min(0)[..., None])[..., 0]
+    log_likelihood = logits.log_softmax(-1).gather(-1, labels.classes.clamp_min(0)[..., None])[
+        ..., 0
+    ]
     counted = labels.classes >= 0
     share = cell_shares(mask, size, render, counted) * labels.confidence.to(render.dtype)
     return -torch.where(counted & (share > 0), share * log_likelihood, 0.0).sum()

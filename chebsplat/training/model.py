@@ -39,8 +39,10 @@ class Wanted(NamedTuple):
 class Auxiliary:
     """What losses need beside the picture; None where it was not wanted or does not exist.
 
-    soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]; in_view bool [V], None: all are. Of the printed method:
-    soft_mask [N] and delta [N, 4] of all Gaussians, fused features [V, C], and L_reg [] (`knowledge`).
+    soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]; in_view bool [V], None: all are. Of
+      the printed method:
+    soft_mask [N] and delta [N, 4] of all Gaussians, fused features [V, C], and L_reg []
+    (`knowledge`).
     """
 
     soft_mask: Tensor | None = None
@@ -53,8 +55,10 @@ class Auxiliary:
 
 @dataclass
 class Rendered:
-    """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C], [h, w, C] by cell of the rasterizer, or None; `index` [V]
-    the Gaussians in the frustum, None: all, with `means2d` [1, V, 2] and `radii` [1, V] in `meta`; planes [H, W, 3],
+    """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C], [h, w, C] by cell of the rasterizer, or
+    None; `index` [V]
+    the Gaussians in the frustum, None: all, with `means2d` [1, V, 2] and `radii` [1, V] in `meta`;
+      planes [H, W, 3],
     Σ w_i q_i of `planes_in_view`, 1 / scene unit, or None.
     """
 
@@ -70,11 +74,14 @@ class Rendered:
 class SceneModel:
     """Raw parameters by name, each [N, ...] and a leaf tensor, and the semantic gate beside them.
 
-    `features` [N, C], `prune_logits` [N] and `sh_logits` [N, 3] are there only if the scene needs them, and SH band l,
-    `sh<l>` [N_l, 2 l + 1, 3], only for the first N_l Gaussians: all until the trainer freezes them.
+    `features` [N, C], `prune_logits` [N] and `sh_logits` [N, 3] are there only if the scene needs
+    them, and SH band l, `sh<l>` [N_l, 2 l + 1, 3], only for the first N_l Gaussians: all until the
+    trainer freezes them.
 
-    Args: raw: of `splats.gaussians.initial_gaussians`, with SH bands or without, on the device that is to compute;
-      n_channels: of the features, None without semantics; backend: of `rasterize`, and of all else in a step that has
+    Args: raw: of `splats.gaussians.initial_gaussians`, with SH bands or without, on the device that
+      is to compute;
+      n_channels: of the features, None without semantics; backend: of `rasterize`, and of all else
+        in a step that has
       a compiled kernel.
     """
 
@@ -120,15 +127,21 @@ class SceneModel:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """What is learned beside the raw parameters, by name: the semantic gate, where there is one."""
+        """What is learned beside the raw parameters, by name: the semantic gate, where there is
+        one.
+        """
         return {} if self.semantic_gate is None else {"semantic_gate": self.semantic_gate}
 
     def bands(self) -> list[Tensor]:
-        """Coefficients [N_l, 2 l + 1, 3] of the SH bands, from 0 to the highest that any Gaussian has."""
+        """Coefficients [N_l, 2 l + 1, 3] of the SH bands, from 0 to the highest that any Gaussian
+        has.
+        """
         return [self.raw[name] for name in BANDS if name in self.raw]
 
     def sh_kept(self) -> float:
-        """Part of all SH coefficients up to degree 3 that the Gaussians keep; until the freeze, would keep."""
+        """Part of all SH coefficients up to degree 3 that the Gaussians keep; until the freeze,
+        would keep.
+        """
         counts = [len(band) for band in self.bands()[1:]]
         if "sh_logits" in self.raw:
             counts = (self.open_bands() > 0.5).sum(0).tolist()[: len(counts)]
@@ -147,19 +160,29 @@ class SceneModel:
     @property
     def learned(self) -> dict[str, Tensor]:
         """The raw parameters, and the weights of the modules as `<module>.<weight>`."""
-        weights = {f"{name}.{k}": w for name, module in self.modules.items() for k, w in module.named_parameters()}
+        weights = {
+            f"{name}.{k}": w
+            for name, module in self.modules.items()
+            for k, w in module.named_parameters()
+        }
         return self.raw | weights
 
     def soft_mask(self) -> Tensor | None:
         """m̂ [N] in (0, 1) of the pruning gates of all Gaussians, None where pruning is off."""
         return self._soft_mask(self.learned, None, self.raw.get("features"))
 
-    def _soft_mask(self, learned: Mapping[str, Tensor], index: Tensor | None, features: Tensor | None) -> Tensor | None:
+    def _soft_mask(
+        self, learned: Mapping[str, Tensor], index: Tensor | None, features: Tensor | None
+    ) -> Tensor | None:
         if "prune_logits" not in learned:
             return None
         semantic, prefix = None, "semantic_gate."
         if self.semantic_gate is not None and features is not None:
-            weights = {name.removeprefix(prefix): w for name, w in learned.items() if name.startswith(prefix)}
+            weights = {
+                name.removeprefix(prefix): w
+                for name, w in learned.items()
+                if name.startswith(prefix)
+            }
             semantic = functional_call(self.semantic_gate, weights, (features.detach(),))
         return prune.soft_mask(take(learned["prune_logits"], index), semantic)
 
@@ -175,39 +198,61 @@ class SceneModel:
     ) -> Rendered:
         """Colour and features in one pass.
 
-        degree: SH bands in use; masked: apply the pruning masks; semantic: render features too; grid: features are
-        only wanted as means over h × w cells, and rendered so where these are the rasterizer's; depth: render it too,
-        three channels beside the colours.
-        Choices: on a GPU all Gaussians are rendered, since to choose those in view is to wait for their number.
+        degree: SH bands in use; masked: apply the pruning masks; semantic: render features too;
+          grid: features are
+        only wanted as means over h × w cells, and rendered so where these are the rasterizer's;
+        depth: render it too, three channels beside the colours.
+        Choices: on a GPU all Gaussians are rendered, since to choose those in view is to wait for
+          their number.
         """
         index = None
         if not self.renders_all:
             with torch.no_grad():
                 index = in_frustum(self.raw["means"], view, _reach(self.raw))
-        wanted, learned = Wanted(degree, masked, semantic, depth, (view.width, view.height)), self.learned
+        wanted, learned = (
+            Wanted(degree, masked, semantic, depth, (view.width, view.height)),
+            self.learned,
+        )
         activated = self.replay(
             wanted,
             partial(self._activate, wanted, tuple(learned), index),
             list(learned.values()),
             [view.viewmat, view.K],
         )
-        gaussians: list[Any] = [activated[name] for name in ("means", "quats", "scales", "opacities", "colors")]
-        auxiliary = Auxiliary(activated.get("soft_mask"), activated.get("band_masks"), in_view=activated.get("in_view"))
+        gaussians: list[Any] = [
+            activated[name] for name in ("means", "quats", "scales", "opacities", "colors")
+        ]
+        auxiliary = Auxiliary(
+            activated.get("soft_mask"),
+            activated.get("band_masks"),
+            in_view=activated.get("in_view"),
+        )
         camera = (view.viewmat[None], view.K[None], view.width, view.height)
         features, cells = activated.get("features"), None
         if index is None:
             render, alpha, meta = rasterize(*gaussians, *camera, backend="cuda", harmless=True)
-        elif features is None or (grid is not None and wanted.size == (CELL * grid[1], CELL * grid[0])):
-            render, alpha, meta = rasterize(*gaussians, *camera, cell_colors=features, backend=self.backend)
+        elif features is None or (
+            grid is not None and wanted.size == (CELL * grid[1], CELL * grid[0])
+        ):
+            render, alpha, meta = rasterize(
+                *gaussians, *camera, cell_colors=features, backend=self.backend
+            )
             cells = None if features is None else meta["cells"][0]
         else:
             gaussians[4] = torch.cat([gaussians[4], features], -1)
             render, alpha, meta = rasterize(*gaussians, *camera, backend=self.backend)
         sizes = [3, 3 * depth, render.shape[-1] - 3 - 3 * depth]
-        rgb, planes, rest = render.squeeze(0).split(sizes, -1)  # one gradient, where slices would make one each
+        # one gradient, where slices would make one each
+        rgb, planes, rest = render.squeeze(0).split(sizes, -1)
         shown = rest if rest.shape[-1] else None
         return Rendered(
-            rgb, alpha.squeeze(0), shown if cells is None else cells, meta, index, auxiliary, planes if depth else None
+            rgb,
+            alpha.squeeze(0),
+            shown if cells is None else cells,
+            meta,
+            index,
+            auxiliary,
+            planes if depth else None,
         )
 
     def _activate(
@@ -219,7 +264,10 @@ class SceneModel:
         """
         raw, (viewmat, K) = dict(zip(names, tensors, strict=False)), tensors[-2:]
         means, quats = take(raw["means"], index), take(raw["quats"], index)
-        scales, opacities = take(raw["log_scales"], index).exp(), take(raw["logit_opacities"], index).sigmoid()
+        scales, opacities = (
+            take(raw["log_scales"], index).exp(),
+            take(raw["logit_opacities"], index).sigmoid(),
+        )
         features = take(raw["features"], index) if "features" in raw else None
         activated: dict[str, Tensor] = {}
         if wanted.masked and (soft := self._soft_mask(raw, index, features)) is not None:
@@ -230,7 +278,9 @@ class SceneModel:
             masks = activated["band_masks"] = sh_prune.band_mask(take(raw["sh_logits"], index))
         eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
         bands = [raw[name] for name in BANDS if name in raw]
-        channels = [colors_in_view(bands, masks, index, raw["means"], eye, wanted.degree, self.backend)]
+        channels = [
+            colors_in_view(bands, masks, index, raw["means"], eye, wanted.degree, self.backend)
+        ]
         if wanted.depth:
             channels.append(planes_in_view(means, quats, scales, viewmat, K, NEAREST))
         if wanted.semantic and features is not None:  # the masks have seen them in any case
@@ -242,8 +292,12 @@ class SceneModel:
         gaussians = (means, quats, scales, opacities, colors)
         if index is None:
             gaussians = made_harmless(*gaussians)
-            activated["in_view"] = may_be_seen(raw["means"].detach(), View(K, viewmat, *wanted.size), _reach(raw))
-        return activated | dict(zip(("means", "quats", "scales", "opacities", "colors"), gaussians, strict=True))
+            activated["in_view"] = may_be_seen(
+                raw["means"].detach(), View(K, viewmat, *wanted.size), _reach(raw)
+            )
+        return activated | dict(
+            zip(("means", "quats", "scales", "opacities", "colors"), gaussians, strict=True)
+        )
 
 
 def _reach(raw: Mapping[str, Tensor]) -> Tensor:

@@ -1,4 +1,6 @@
-"""Rows of parameters, and of the optimizer's moments, when Gaussians come, go and are put into another order."""
+"""Rows of parameters, and of the optimizer's moments, when Gaussians come, go and are put into
+another order.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +14,16 @@ from chebsplat.training.densify import Additions
 
 
 def select(raw: dict[str, Tensor], keep: Tensor) -> dict[str, Tensor]:
-    """The rows `keep` [N] bool of every tensor [N, ...], or [N_l, ...] that only the first N_l Gaussians have."""
+    """The rows `keep` [N] bool of every tensor [N, ...], or [N_l, ...] that only the first N_l
+    Gaussians have.
+    """
     return {name: value.detach()[keep[: len(value)]] for name, value in raw.items()}
 
 
 def append(raw: dict[str, Tensor], rows: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Every tensor [N, ...] followed by its new rows [A, ...]. Raises ValueError if names or lengths disagree."""
+    """Every tensor [N, ...] followed by its new rows [A, ...]. Raises ValueError if names or
+    lengths disagree.
+    """
     if raw.keys() != rows.keys() or len({len(value) for value in rows.values()}) > 1:
         shapes = {name: tuple(value.shape) for name, value in rows.items()}
         raise ValueError(f"rows {shapes} do not fit parameters {sorted(raw)}")
@@ -25,14 +31,25 @@ def append(raw: dict[str, Tensor], rows: dict[str, Tensor]) -> dict[str, Tensor]
 
 
 def prune_optimizer(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], keep: Tensor) -> None:
-    """Keep the rows `keep` [N] bool of parameters and moments; `raw` and the groups get the new leaves."""
+    """Keep the rows `keep` [N] bool of parameters and moments; `raw` and the groups get the new
+    leaves.
+    """
     _replace(optimizer, raw, select(raw, keep), lambda moment: moment[keep[: len(moment)]])
 
 
-def reorder_optimizer(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], rows: dict[str, Tensor]) -> None:
-    """Parameters and moments by name become their rows i64; those that have none left are gone, groups and all."""
+def reorder_optimizer(
+    optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], rows: dict[str, Tensor]
+) -> None:
+    """Parameters and moments by name become their rows i64; those that have none left are gone,
+    groups and all.
+    """
     for name, order in rows.items():
-        _replace(optimizer, raw, {name: raw[name].detach()[order]}, partial(torch.index_select, dim=0, index=order))
+        _replace(
+            optimizer,
+            raw,
+            {name: raw[name].detach()[order]},
+            partial(torch.index_select, dim=0, index=order),
+        )
         if len(order) == 0:
             drop(optimizer, raw, name)
 
@@ -46,10 +63,13 @@ def drop(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], name: str) ->
     optimizer.param_groups[:] = [group for group in optimizer.param_groups if group["params"]]
 
 
-def extend_optimizer(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], rows: dict[str, Tensor]) -> None:
+def extend_optimizer(
+    optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], rows: dict[str, Tensor]
+) -> None:
     """Append rows [A, ...] to parameters; their moments start at zero, those of the others stay.
 
-    Choices: the step count is one for a parameter, so new rows share it: their first steps are up to 3 times longer.
+    Choices: the step count is one for a parameter, so new rows share it: their first steps are up
+      to 3 times longer.
     """
     count = len(next(iter(rows.values())))
     _replace(
@@ -60,10 +80,13 @@ def extend_optimizer(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], r
     )
 
 
-def apply_additions(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], additions: Additions) -> None:
+def apply_additions(
+    optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], additions: Additions
+) -> None:
     """Write what the parents take on, with zero moments where it differs, and append the new rows.
 
-    Choices: a clone's parent, unchanged, keeps its moments, so that the two do not move as one for ever.
+    Choices: a clone's parent, unchanged, keeps its moments, so that the two do not move as one for
+      ever.
     """
     if len(additions.parents) == 0:
         return
@@ -86,7 +109,11 @@ def forget(optimizer: torch.optim.Optimizer, parameter: Tensor) -> None:
 def _moments(optimizer: torch.optim.Optimizer, parameter: Tensor) -> dict[str, Tensor]:
     """What the optimizer holds per entry of a parameter; the step count is not."""
     state = optimizer.state.get(parameter, {})
-    return {k: v for k, v in state.items() if isinstance(v, Tensor) and v.ndim and v.shape == parameter.shape}
+    return {
+        k: v
+        for k, v in state.items()
+        if isinstance(v, Tensor) and v.ndim and v.shape == parameter.shape
+    }
 
 
 def _replace(
@@ -99,7 +126,9 @@ def _replace(
         old = raw[name]
         raw[name] = fresh = value.clone().requires_grad_(old.requires_grad)
         for group in optimizer.param_groups:
-            group["params"][:] = [fresh if parameter is old else parameter for parameter in group["params"]]
+            group["params"][:] = [
+                fresh if parameter is old else parameter for parameter in group["params"]
+            ]
         moments = {key: moved(moment) for key, moment in _moments(optimizer, old).items()}
         state = optimizer.state.pop(old, {})
         if state:

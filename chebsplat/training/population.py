@@ -1,4 +1,6 @@
-"""Which Gaussians there are: growth, removal, the freeze of SH bands. Parameters and moments keep together."""
+"""Which Gaussians there are: growth, removal, the freeze of SH bands. Parameters and moments keep
+together.
+"""
 
 from __future__ import annotations
 
@@ -24,18 +26,23 @@ class Population:
     """The Gaussians of a model under an optimizer whose groups are named for the raw parameters.
 
     places: of the training cameras, scene units [V, 3]; those that are not finite bound nothing.
-    `n_grown` and `n_reset` count the times that some were added and that all were dimmed, the others Gaussians:
-    `n_broken` those whose values a step made non-finite. The caller refreshes the regions after any change.
+    `n_grown` and `n_reset` count the times that some were added and that all were dimmed, the
+    others Gaussians: `n_broken` those whose values a step made non-finite. The caller refreshes the
+      regions after any change.
     """
 
-    def __init__(self, model: SceneModel, settings: TrainSection, extent: float, places: np.ndarray):
+    def __init__(
+        self, model: SceneModel, settings: TrainSection, extent: float, places: np.ndarray
+    ):
         self.model, self.settings, self.extent = model, settings, extent
         self.cameras = cKDTree(places[np.isfinite(places).all(1)])
         self.n_grown = self.n_reset = self.n_added = self.n_removed = self.n_broken = 0
         self.clear_gradients()
 
     def state_dict(self) -> dict[str, Any]:
-        """Counts, bounds, and the gradients gathered since growth: tensors, not copied, and plain values."""
+        """Counts, bounds, and the gradients gathered since growth: tensors, not copied, and plain
+        values.
+        """
         return {
             "counts": [self.n_grown, self.n_reset, self.n_added, self.n_removed, self.n_broken],
             "tensors": [self.gradient_sum, self.gradient_count, self.log_bound],
@@ -52,7 +59,9 @@ class Population:
         self.gradient_sum, self.gradient_count = (means.new_zeros(len(means)) for _ in range(2))
 
     def note_gradients(self, rendered: Rendered) -> None:
-        """Length of the total loss' gradient to the 2D means, in half image widths as gsplat counts it."""
+        """Length of the total loss' gradient to the 2D means, in half image widths as gsplat counts
+        it.
+        """
         if self.settings.region_gradient == "features" and rendered.auxiliary.fused is not None:
             gradient = rendered.auxiliary.fused.grad
             if gradient is not None:
@@ -82,32 +91,47 @@ class Population:
 
     @torch.no_grad()
     def bound_scales(self) -> None:
-        """Keep scales below `scale_limit` times the distance to the nearest camera, as `note_distances` saw it last.
+        """Keep scales below `scale_limit` times the distance to the nearest camera, as
+        `note_distances` saw it last.
 
-        Choices: EWA takes perspective for linear across a Gaussian, which holds for small ones. A needle that reaches
-          past cameras is another haze before each of them, and training fits it to those that it has. At a third, three
-          standard deviations end before the nearest camera.
+        Choices: EWA takes perspective for linear across a Gaussian, which holds for small ones. A
+          needle that reaches past cameras is another haze before each of them, and training fits it
+          to those that it has. At a third, three standard deviations end before the nearest camera.
         """
         scales = self.model.raw["log_scales"]
         torch.minimum(scales, self.log_bound, out=scales)
 
-    def grow(self, optimizer: torch.optim.Optimizer, members: Tensor, generator: torch.Generator) -> None:
-        """Densify: by regions (Eqs 11-12), whose members are i64 [M, n], by classic clone and split, or by turns.
+    def grow(
+        self, optimizer: torch.optim.Optimizer, members: Tensor, generator: torch.Generator
+    ) -> None:
+        """Densify: by regions (Eqs 11-12), whose members are i64 [M, n], by classic clone and
+        split, or by turns.
 
-        Choices: regions place new Gaussians where a neighbourhood is too sparse, splitting sharpens single ones that
-          are too large; turns beat either alone (office0, 2000 steps: 36.2 dB against 35.1 and 35.7).
+        Choices: regions place new Gaussians where a neighbourhood is too sparse, splitting sharpens
+          single ones that are too large; turns beat either alone (office0, 2000 steps: 36.2 dB
+          against 35.1 and 35.7).
         """
-        settings, raw = self.settings, {name: value.detach() for name, value in self.model.raw.items()}
+        settings, raw = (
+            self.settings,
+            {name: value.detach() for name, value in self.model.raw.items()},
+        )
         left = max(settings.max_gaussians - len(self.model), 0)
         budget = min(left, settings.max_gaussians // max(settings.n_densify, 1))
         self.n_grown += 1
         if budget == 0:
             return
-        gradient, threshold = self.gradient_sum / self.gradient_count.clamp_min(1), settings.grow_threshold
+        gradient, threshold = (
+            self.gradient_sum / self.gradient_count.clamp_min(1),
+            settings.grow_threshold,
+        )
         if isinstance(self.model, PrintedScene):
             additions = self.model.additions(gradient, threshold, budget, generator)
-        elif settings.densify == "classic" or (settings.densify == "mixed" and self.n_grown % 2 == 0):
-            additions = densify.clone_or_split(raw, gradient, threshold, 0.01 * self.extent, budget, generator)
+        elif settings.densify == "classic" or (
+            settings.densify == "mixed" and self.n_grown % 2 == 0
+        ):
+            additions = densify.clone_or_split(
+                raw, gradient, threshold, 0.01 * self.extent, budget, generator
+            )
         else:
             mean = densify.region_gradients(gradient, members)
             additions = densify.densify(raw, members, mean, threshold, budget, generator)
@@ -116,7 +140,9 @@ class Population:
 
     @torch.no_grad()
     def remove(self, optimizer: torch.optim.Optimizer, mask: Tensor | None) -> None:
-        """Hard-prune what is faint or, of the first Gaussians, closed by their soft mask; `min_gaussians` stay."""
+        """Hard-prune what is faint or, of the first Gaussians, closed by their soft mask;
+        `min_gaussians` stay.
+        """
         strength = self.model.raw["logit_opacities"].sigmoid()
         if mask is not None:
             strength[: len(mask)] *= prune.hard_mask(mask)
@@ -128,7 +154,9 @@ class Population:
 
     @torch.no_grad()
     def dim(self, optimizer: torch.optim.Optimizer) -> None:
-        """3DGS's reset: no opacity above DIMMED. What the photos need comes back, what floats does not."""
+        """3DGS's reset: no opacity above DIMMED. What the photos need comes back, what floats does
+        not.
+        """
         opacities = self.model.raw["logit_opacities"]
         opacities.clamp_(max=math.log(DIMMED / (1 - DIMMED)))
         optimizer_rows.forget(optimizer, opacities)
@@ -136,7 +164,9 @@ class Population:
 
     @torch.no_grad()
     def drop_broken(self, optimizer: torch.optim.Optimizer) -> bool:
-        """Remove Gaussians with a value that is not finite; were there any? Leaves fewer than `min_gaussians` alone."""
+        """Remove Gaussians with a value that is not finite; were there any? Leaves fewer than
+        `min_gaussians` alone.
+        """
         sound = torch.ones(len(self.model), dtype=torch.bool, device=self.model.device)
         for value in self.model.raw.values():
             sound[: len(value)] &= finite_rows(value)
@@ -152,13 +182,17 @@ class Population:
 
     @torch.no_grad()
     def freeze_bands(self, optimizer: torch.optim.Optimizer) -> None:
-        """Fix every Gaussian's SH degree, once: what is closed leaves parameters, moments and memory."""
+        """Fix every Gaussian's SH degree, once: what is closed leaves parameters, moments and
+        memory.
+        """
         raw = self.model.raw
         degrees = self.model.close_bands().clamp_max(self.settings.sh_degree)
         rows = sh_prune.ragged_rows(degrees)
         optimizer_rows.drop(optimizer, raw, "sh_logits")
         bands = {f"sh{band}": rows[band] for band in range(1, 4)}
-        optimizer_rows.reorder_optimizer(optimizer, raw, {name: bands.get(name, rows[0]) for name in raw})
+        optimizer_rows.reorder_optimizer(
+            optimizer, raw, {name: bands.get(name, rows[0]) for name in raw}
+        )
         self.clear_gradients()
 
 
@@ -172,5 +206,7 @@ def broken(model: SceneModel) -> str:
     rows = [(name, (~finite_rows(value)).nonzero()[:, 0]) for name, value in model.raw.items()]
     parts = [f"{name} of {len(bad)} Gaussians, first {bad[0]}" for name, bad in rows if len(bad)]
     for name, module in model.modules.items():
-        parts += [f"{name}.{k}" for k, value in module.named_parameters() if not value.isfinite().all()]
+        parts += [
+            f"{name}.{k}" for k, value in module.named_parameters() if not value.isfinite().all()
+        ]
     return "not finite: " + ", ".join(parts) if parts else ""

@@ -1,4 +1,6 @@
-"""The paper's method in the trainer: a scene whose every step runs the modules of `chebsplat.printed`."""
+"""The paper's method in the trainer: a scene whose every step runs the modules of
+`chebsplat.printed`.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,8 @@ THRESHOLD = 0.1  # of soft masks, of Gaussians and of SH bands
 SOFTNESS = 100.0  # gamma of Eq 13: a bin's edge is about a tenth of a colour's usual range
 CANDIDATES, MOST_CANDIDATES = 8, 32  # in a region of the mean number of points, and in any (Eq 12)
 NEAREST, FARTHEST = 0.5, 2.0  # of a candidate to its neighbour, in the scene's median spacings
-STEEP_FEATURES = 2.5e-5  # |grad f| above which a region grows, by the features' gradient: a quarter of office0's do
+# |grad f| above which a region grows, by the features' gradient: a quarter of office0's do
+STEEP_FEATURES = 2.5e-5
 KAPPA, EPSILON, ETA = 1.0, 0.2, 0.9  # of the knowledge space's growth (Eq 15)
 
 
@@ -50,13 +53,15 @@ class Modules(nn.Module):
         self.pruning = None if without == "pruning guidance" else pruning.PruningGate(n_channels)
         self.band_masks = None if without == "SH guidance" else sh_pruning.BandMasks(n_channels)
         self.modulation = knowledge.Modulation(self.width)
-        self.register_buffer("in_view", torch.ones(()))  # part of the Gaussians that views see, their running mean
+        # part of the Gaussians that views see, their running mean
+        self.register_buffer("in_view", torch.ones(()))
 
 
 class Encoded(NamedTuple):
     """Of the Gaussians `index`: fused and shape features [V, C].
 
-    regions: of positions in `index`, not of Gaussians' numbers, with tokens [M, t, Q] and descriptors [M, n, Q].
+    regions: of positions in `index`, not of Gaussians' numbers, with tokens [M, t, Q] and
+      descriptors [M, n, Q].
     """
 
     fused: Tensor
@@ -69,8 +74,10 @@ class Encoded(NamedTuple):
 class PrintedScene(SceneModel):
     """A `SceneModel` by the print: `sh_logits` are [N, 4], and fused features go into everything.
 
-    bases: B of each key projection matrix, by name, of the scenes before; empty: none. Regions, descriptors and
-    weights of Eq 8 are those of the Gaussians as they are at a step, without gradient to means and covariances.
+    bases: B of each key projection matrix, by name, of the scenes before; empty: none. Regions,
+      descriptors and
+    weights of Eq 8 are those of the Gaussians as they are at a step, without gradient to means and
+    covariances.
     """
 
     def __init__(
@@ -85,7 +92,9 @@ class PrintedScene(SceneModel):
         super().__init__(raw, describe, train, n_channels, backend)
         self.semantic_gate = None
         if "sh_logits" in self.raw:
-            self.raw["sh_logits"] = torch.zeros(len(self), 4, device=self.device, requires_grad=True)
+            self.raw["sh_logits"] = torch.zeros(
+                len(self), 4, device=self.device, requires_grad=True
+            )
         self.angles = torch.arange(describe.n_angles) * (2 * math.pi / describe.n_angles)
         self.draws = torch.Generator()  # the trainer's, once there is one; of steps alone
         self.seed, self.bases = train.seed, dict[str, Tensor]()
@@ -98,16 +107,21 @@ class PrintedScene(SceneModel):
     def encoded(self, index: Tensor, count: int) -> Encoded:
         """Fused features of the Gaussians `index` [V] by `count` regions of them (Eqs 1-10).
 
-        Where nothing learns, what is drawn is the same at every call: measuring changes no training.
+        Where nothing learns, what is drawn is the same at every call: measuring changes no
+        training.
         """
         raw, parts = self.raw, self.printed
         draws = self.draws if torch.is_grad_enabled() else torch.Generator().manual_seed(self.seed)
         with torch.no_grad():
             points = raw["means"][index]
-            spreads = covariances(raw["quats"][index].double(), raw["log_scales"][index].double().exp())
+            spreads = covariances(
+                raw["quats"][index].double(), raw["log_scales"][index].double().exp()
+            )
             regions = regions_of(points, count, self.describe.region_size, draws)
             rows, present = regions.members.clamp_min(0), regions.members >= 0
-            largest = raw["log_scales"][index].amax(1).exp().square().median() if len(index) else 1.0
+            largest = (
+                raw["log_scales"][index].amax(1).exp().square().median() if len(index) else 1.0
+            )
             described = points.new_zeros(*rows.shape, parts.width)
             if self.without != "descriptor":
                 described = descriptor(
@@ -122,7 +136,9 @@ class PrintedScene(SceneModel):
                 )
             middle = regions.centers
             places = points.double(), points[middle].double()
-            shares = propagation.weights(*places, spreads[middle], regions.pairs, TEMPERATURE).to(points)
+            shares = propagation.weights(*places, spreads[middle], regions.pairs, TEMPERATURE).to(
+                points
+            )
             covered = torch.zeros(len(index), dtype=torch.bool)
             covered[regions.pairs[0]] = True
         tokens = parts.encoder.tokens(described, points[rows])
@@ -131,10 +147,13 @@ class PrintedScene(SceneModel):
         fused = parts.gate(shape, take(raw["features"], index), covered)
         return Encoded(fused, shape, regions, tokens, described)
 
-    def masks(self, features: Tensor, index: Tensor, regions: Regions) -> tuple[Tensor | None, Tensor | None]:
+    def masks(
+        self, features: Tensor, index: Tensor, regions: Regions
+    ) -> tuple[Tensor | None, Tensor | None]:
         """Soft masks [N] of all Gaussians and [N, 4] of their SH bands; None where switched off.
 
-        Args: features [N, C]: fused where they are in the regions of the Gaussians `index`, else their own.
+        Args: features [N, C]: fused where they are in the regions of the Gaussians `index`, else
+          their own.
         """
         raw, parts = self.raw, self.printed
         soft = delta = None
@@ -176,9 +195,14 @@ class PrintedScene(SceneModel):
         soft = delta = None
         if masked:
             soft, delta = self.masks(raw["features"].index_copy(0, index, fused), index, regions)
-        scales, opacities = take(raw["log_scales"], index).exp(), take(raw["logit_opacities"], index).sigmoid()
+        scales, opacities = (
+            take(raw["log_scales"], index).exp(),
+            take(raw["logit_opacities"], index).sigmoid(),
+        )
         if soft is not None:
-            scales, opacities = pruning.apply_mask(pruning.binarize(soft[index], THRESHOLD), scales, opacities)
+            scales, opacities = pruning.apply_mask(
+                pruning.binarize(soft[index], THRESHOLD), scales, opacities
+            )
         bands = self.bands()
         if delta is not None:
             open_bands = pruning.binarize(delta, THRESHOLD)
@@ -195,7 +219,9 @@ class PrintedScene(SceneModel):
         return Rendered(image, alpha[0], features if semantic else None, meta, index, auxiliary)
 
     def _pull(self, tokens: Tensor, regions: Regions) -> Tensor | None:
-        """L_reg (Eq 14): mean over key projection matrices, alpha the mean over regions; None without a basis."""
+        """L_reg (Eq 14): mean over key projection matrices, alpha the mean over regions; None
+        without a basis.
+        """
         if not self.bases or not len(regions.centers):
             return None
         present = nn.functional.pad(regions.members >= 0, (1, 0), value=True)
@@ -213,7 +239,8 @@ class PrintedScene(SceneModel):
     def whole(self) -> Encoded:
         """Of all Gaussians.
 
-        Choices: the print fuses within a view's frustum; a scene that is stored has one feature a Gaussian.
+        Choices: the print fuses within a view's frustum; a scene that is stored has one feature a
+          Gaussian.
         """
         return self.encoded(self.rows, self.n_regions)
 
@@ -230,7 +257,9 @@ class PrintedScene(SceneModel):
 
     @torch.no_grad()
     def close_bands(self) -> Tensor:
-        """Set closed bands, the lowest included, to zero; returns each Gaussian's highest open band u8 [N]."""
+        """Set closed bands, the lowest included, to zero; returns each Gaussian's highest open band
+        u8 [N].
+        """
         is_open = self._open()
         for band, kept in zip(self.bands(), is_open.unbind(1), strict=False):
             band.mul_(kept[:, None, None])
@@ -256,7 +285,9 @@ class PrintedScene(SceneModel):
         whole = self.whole()
         sigma = float(knowledge.spread(whole.descriptors, whole.regions.members >= 0).mean())
         return {
-            name: knowledge.update(W, self.bases.get(name), sigma, kappa=KAPPA, epsilon=EPSILON, eta=ETA)
+            name: knowledge.update(
+                W, self.bases.get(name), sigma, kappa=KAPPA, epsilon=EPSILON, eta=ETA
+            )
             for name, W in self.printed.encoder.key_projections().items()
         }
 
@@ -276,11 +307,15 @@ class PrintedScene(SceneModel):
         }
 
     @torch.no_grad()
-    def additions(self, gradient: Tensor, threshold: float, budget: int, generator: torch.Generator) -> Additions:
-        """New Gaussians in regions of steep gradient [N] (Eqs 11-12), the steepest first, `budget` at most.
+    def additions(
+        self, gradient: Tensor, threshold: float, budget: int, generator: torch.Generator
+    ) -> Additions:
+        """New Gaussians in regions of steep gradient [N] (Eqs 11-12), the steepest first, `budget`
+        at most.
 
-        Choices: alpha_d is such that a region of the mean number of points gets CANDIDATES; V_pc is the ball's.
-          Bounds of the distance are NEAREST and FARTHEST times the scene's median spacing.
+        Choices: alpha_d is such that a region of the mean number of points gets CANDIDATES; V_pc is
+          the ball's. Bounds of the distance are NEAREST and FARTHEST times the scene's median
+          spacing.
         """
         means = self.raw["means"].detach()
         regions = regions_of(means, self.n_regions, self.describe.region_size, generator)
@@ -290,13 +325,17 @@ class PrintedScene(SceneModel):
         n_points = torch.bincount(regions.pairs[1], minlength=len(regions.centers))
         volume = densification.ball_volume(regions.radius)
         density = CANDIDATES * float(n_points.double().mean()) / volume
-        counts = densification.candidate_counts(torch.full_like(mean, volume), n_points, density, MOST_CANDIDATES)
+        counts = densification.candidate_counts(
+            torch.full_like(mean, volume), n_points, density, MOST_CANDIDATES
+        )
         order = mean.argsort(descending=True, stable=True)
         order = order[mean[order] > threshold]
         middle = means[regions.centers[order]].repeat_interleave(counts[order], 0)
         candidates = densification.in_ball(middle, regions.radius, generator)
         spacing = _median_spacing(means)
-        kept, parents = densification.accepted(candidates, means, NEAREST * spacing, FARTHEST * spacing)
+        kept, parents = densification.accepted(
+            candidates, means, NEAREST * spacing, FARTHEST * spacing
+        )
         candidates, parents = candidates[kept][:budget], parents[kept][:budget]
         rows = {name: value.detach()[parents] for name, value in self.raw.items()}
         return Additions(parents, rows | {"means": candidates}, {})

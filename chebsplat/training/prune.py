@@ -11,8 +11,10 @@ THRESHOLD = 0.1  # of a soft mask: below, a Gaussian or an SH band is closed
 class SemanticGate(nn.Module):
     """Pruning logit [N] from semantic features [N, C]; starts open, alike for all.
 
-    Choices: starts at logit 1, m̂ = 0.73, with `prune_logits` at 1 too: from 3 a short training's λ does not get any
-      mask below the threshold. The caller detaches the features: they are taught by the teacher, not by pruning.
+    Choices: starts at logit 1, m̂ = 0.73, with `prune_logits` at 1 too: from 3 a short training's λ
+      does not get any
+      mask below the threshold. The caller detaches the features: they are taught by the teacher,
+        not by pruning.
     """
 
     def __init__(self, n_channels: int, initial: float = 1.0):
@@ -27,13 +29,18 @@ class SemanticGate(nn.Module):
 
 
 def soft_mask(render_logits: Tensor, semantic_logits: Tensor | None) -> Tensor:
-    """m̂ [N] in (0, 1) of the rendering gate's logits [N] and the semantic gate's, the first alone without semantics.
+    """m̂ [N] in (0, 1) of the rendering gate's logits [N] and the semantic gate's, the first alone
+    without semantics.
 
-    Choices: the product, so that either gate alone can remove and neither overrules the other's removal; logits are
-      clamped to ±10.
+    Choices: the product, so that either gate alone can remove and neither overrules the other's
+      removal; logits are clamped to ±10.
     """
     soft = render_logits.clamp(-MAX_LOGIT, MAX_LOGIT).sigmoid()
-    return soft if semantic_logits is None else soft * semantic_logits.clamp(-MAX_LOGIT, MAX_LOGIT).sigmoid()
+    return (
+        soft
+        if semantic_logits is None
+        else soft * semantic_logits.clamp(-MAX_LOGIT, MAX_LOGIT).sigmoid()
+    )
 
 
 def hard_mask(soft: Tensor) -> Tensor:
@@ -42,5 +49,7 @@ def hard_mask(soft: Tensor) -> Tensor:
 
 
 def apply_mask(mask: Tensor, scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-    """Masked scales [N, 3] and opacities [N], at render time only: what is stored never becomes log 0."""
+    """Masked scales [N, 3] and opacities [N], at render time only: what is stored never becomes log
+    0.
+    """
     return scales * mask[:, None], opacities * mask

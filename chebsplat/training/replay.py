@@ -16,7 +16,9 @@ Function = Callable[..., dict[str, Tensor]]
 
 @dataclass
 class Recording:
-    """The layout of what a call was given beside leaves, and its CUDA graph from the second call on."""
+    """The layout of what a call was given beside leaves, and its CUDA graph from the second call
+    on.
+    """
 
     layout: list[tuple[Any, ...]]
     graph: Function | None = None
@@ -25,8 +27,9 @@ class Recording:
 class Replay:
     """Calls functions; on a GPU it records each as a CUDA graph and replays that.
 
-    A small scene's step is hundreds of small operations, which take longer to launch than to compute.
-    A recording holds for the same `key` and tensors of the same shapes, and all of them for the same
+    A small scene's step is hundreds of small operations, which take longer to launch than to
+    compute. A recording holds for the same `key` and tensors of the same shapes, and all of them
+    for the same
     leaves: after growth and pruning they are made again. A first call is not recorded, so that
     libraries have prepared what they need, nor is one without gradients. Where torch or the driver
     cannot record, a warning says so, and `records` becomes false: then nothing is.
@@ -43,8 +46,9 @@ class Replay:
     ) -> dict[str, Tensor]:
         """`function(*leaves, *given)`, a dictionary of tensors.
 
-        Args: key: what the function depends on beside its tensors; leaves: read where they lie, so that
-          what an optimizer wrote there is seen, or none; given: copied into the recording at each call.
+        Args: key: what the function depends on beside its tensors; leaves: read where they lie, so
+          that what an optimizer wrote there is seen, or none; given: copied into the recording at
+          each call.
         """
         if not self.records or not torch.is_grad_enabled():
             return function(*leaves, *given)
@@ -57,14 +61,20 @@ class Replay:
             self.recordings[key] = Recording(layout)
             return function(*leaves, *given)
         if recording.graph is None:  # of aliases, so that gradients of the leaves are no part of it
-            samples = [*(leaf.detach() for leaf in leaves), *(value.detach().clone() for value in given)]
+            samples = [
+                *(leaf.detach() for leaf in leaves),
+                *(value.detach().clone() for value in given),
+            ]
             for sample, value in zip(samples, (*leaves, *given), strict=True):
                 sample.requires_grad_(value.requires_grad)
             try:
-                graph: Any = torch.cuda.make_graphed_callables(function, tuple(samples), 0, allow_unused_input=True)
+                graph: Any = torch.cuda.make_graphed_callables(
+                    function, tuple(samples), 0, allow_unused_input=True
+                )
             except RuntimeError as error:
                 log.warning(
-                    "a step's operations are launched one by one; no CUDA graph: %s", str(error).splitlines()[0]
+                    "a step's operations are launched one by one; no CUDA graph: %s",
+                    str(error).splitlines()[0],
                 )
                 self.records, self.leaves = False, []
                 self.recordings.clear()  # whose memory the step may need

@@ -1,4 +1,6 @@
-"""The optimizer's rates, and what is due when in a training, as a function of the share of its budget that is spent."""
+"""The optimizer's rates, and what is due when in a training, as a function of the share of its
+budget that is spent.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +15,23 @@ from chebsplat.training.model import SceneModel
 STEP_SIDE = 640  # pixels of the longer side of what a step looks at, at least
 LR_OPACITIES = 5e-2  # of opacities before the sigmoid, 3DGS's
 LR_MODULES = 3e-3  # of the semantic gate
-FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}  # what a rate has fallen to at the end; 0.1 elsewhere
+# what a rate has fallen to at the end; 0.1 elsewhere
+FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}
 
 
 def require_resolved(settings: TrainSection) -> None:
-    """Raises ValueError naming a setting that is still open (`stages.training.defaults.resolved` decides them)."""
+    """Raises ValueError naming a setting that is still open (`stages.training.defaults.resolved`
+    decides them).
+    """
     left = [name for name, value in settings if value is None and name not in ("seconds", "start")]
     if left:
         raise ValueError(f"train.{left[0]} is open: pass a section that is resolved")
 
 
 def rates(settings: TrainSection) -> dict[str, float]:
-    """Learning rate of each raw parameter before any schedule; that of `means` is relative to the scene's extent."""
+    """Learning rate of each raw parameter before any schedule; that of `means` is relative to the
+    scene's extent.
+    """
     given = {
         "means": settings.lr_means,
         "log_scales": settings.lr_scales,
@@ -42,8 +49,9 @@ def rates(settings: TrainSection) -> dict[str, float]:
 
 
 def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.optim.Adam:
-    """A group for each raw parameter of the model, one for SH bands 1 to 3 together, which have one rate (each group is
-    two launches on a GPU), and one for its modules, with their `rate` before any schedule.
+    """A group for each raw parameter of the model, one for SH bands 1 to 3 together, which have one
+    rate (each group is two launches on a GPU), and one for its modules, with their `rate` before
+    any schedule.
 
     Args: settings: the train section; extent: scene units, scales the means' rate.
     """
@@ -52,7 +60,9 @@ def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.opti
     for name, value in model.raw.items():
         rate = base_rates[name] * (extent if name == "means" else 1)
         group = "sh" if name in ("sh1", "sh2", "sh3") else name
-        groups.setdefault(group, {"params": [], "rate": rate, "name": group})["params"].append(value)
+        groups.setdefault(group, {"params": [], "rate": rate, "name": group})["params"].append(
+            value
+        )
     if weights := [p for module in model.modules.values() for p in module.parameters()]:
         groups["modules"] = {"params": weights, "rate": LR_MODULES, "name": "modules"}
     return torch.optim.Adam(list(groups.values()), eps=1e-15, fused=True)
@@ -61,7 +71,8 @@ def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.opti
 class Schedule:
     """Of a resolved train section, and photos whose longer side has `side` pixels.
 
-    A budget is a number of steps, or seconds of training: then the pace is the machine's, and no two
+    A budget is a number of steps, or seconds of training: then the pace is the machine's, and no
+      two
     runs are the same.
     """
 
@@ -92,12 +103,16 @@ class Schedule:
         return max(step, round(step * self.seconds / seconds)) if seconds > 0 else step + 1
 
     def rate(self, name: str, share: float, steps: int) -> float:
-        """What a group's learning rate is multiplied by, in a training that will have about so many steps.
+        """What a group's learning rate is multiplied by, in a training that will have about so many
+        steps.
 
-        Choices: pruning masks go no farther in a long training than in one of MOST_STEPS. A penalty that Adam turns
-          into steps of one size closes them for as long as it lasts: 8000 steps left a room 4,832 of 40,000 Gaussians.
-          While steps look at windows, all are slower by the photos' reduction: a Gaussian is in few of them, and
-          between them Adam's mean square of gradients falls, and each step would go that much farther.
+        Choices: pruning masks go no farther in a long training than in one of MOST_STEPS. A penalty
+          that Adam turns
+          into steps of one size closes them for as long as it lasts: 8000 steps left a room 4,832
+            of 40,000 Gaussians.
+          While steps look at windows, all are slower by the photos' reduction: a Gaussian is in few
+          of them, and between them Adam's mean square of gradients falls, and each step would go
+          that much farther.
         """
         slower = min(MOST_STEPS / max(steps, 1), 1.0) if name == "prune_logits" else 1.0
         slower /= self.reduction if self.in_full(share) else 1
@@ -112,7 +127,9 @@ class Schedule:
         return self.reduction * (2 if share <= self.settings.coarse_until else 1)
 
     def in_full(self, share: float) -> bool:
-        """Do steps look at windows of the photos as they are? Not at photos that a step can take whole."""
+        """Do steps look at windows of the photos as they are? Not at photos that a step can take
+        whole.
+        """
         return self.reduction > 1 and share > self.settings.fine_from
 
     def grown(self, share: float) -> int:
@@ -132,5 +149,7 @@ class Schedule:
         return share >= self.settings.densify_until
 
     def freezes_bands(self, share: float) -> bool:
-        """Do SH bands stay as they are? Those that are to stay from the end on do so once the training has ended."""
+        """Do SH bands stay as they are? Those that are to stay from the end on do so once the
+        training has ended.
+        """
         return self.settings.sh_freeze < 1 and share >= self.settings.sh_freeze

@@ -31,7 +31,8 @@ from chebsplat.training.schedule import Schedule, adam
 from chebsplat.views import TaughtLabels, Views, Window, reduced
 
 WEIGHT_SSIM = 0.2  # share of SSIM in the colour loss, 3DGS's λ
-WHOLE = 4  # steps, at least, from one that looks at a whole photo to the next, while others look at windows
+# steps, at least, from one that looks at a whole photo to the next, while others look at windows
+WHOLE = 4
 READ_EVERY = 10  # steps on a GPU from one that waits for its figures to the next
 
 
@@ -41,10 +42,11 @@ class Trainer:
     Args:
       settings: resolved, nothing left open (`stages.training.defaults`).
       extent:   scene units, scales the means' learning rate.
-    The model's Gaussians say which device computes; views and cameras are to be there, too. On a GPU one
-    step in READ_EVERY waits for its figures, the others for nothing: within these a loss that is not finite is found.
-    `state_dict()` between two steps holds all that the steps to come depend on: a trainer that loads it takes them as
-    this one does, to the bit, with as many threads.
+    The model's Gaussians say which device computes; views and cameras are to be there, too. On a
+    GPU one step in READ_EVERY waits for its figures, the others for nothing: within these a loss
+    that is not finite is found. `state_dict()` between two steps holds all that the steps to come
+    depend on: a trainer that loads it takes them as this one does, to the bit, with as many
+      threads.
     """
 
     def __init__(self, model: SceneModel, views: Views, settings: TrainSection, extent: float):
@@ -57,7 +59,8 @@ class Trainer:
         self.optimizer = adam(self.model, self.settings, self.extent)
         self.order_generator = np.random.default_rng(settings.seed)
         self.generator = torch.Generator().manual_seed(settings.seed)
-        model.replay = Replay(model.replay.records and settings.densify_semantic)  # a recording has one pass backward
+        # a recording has one pass backward
+        model.replay = Replay(model.replay.records and settings.densify_semantic)
         if isinstance(model, PrintedScene):
             model.draws = self.generator
         self.order: list[int] = []  # views still to be seen before any is seen again
@@ -74,20 +77,27 @@ class Trainer:
 
     @property
     def reads(self) -> bool:
-        """Whether this step's figures are numbers: every step's on the CPU; tensors wait for nobody on a GPU."""
+        """Whether this step's figures are numbers: every step's on the CPU; tensors wait for nobody
+        on a GPU.
+        """
         return self.model.device.type == "cpu" or self.step % READ_EVERY == 0
 
     def steps(self) -> Iterator[dict[str, float | Tensor]]:
-        """Train until the budget is spent; yields each step's figures, as tensors [] where it does not read them."""
+        """Train until the budget is spent; yields each step's figures, as tensors [] where it does
+        not read them.
+        """
         while self.share < 1:
             began = time.perf_counter()
             self.laps.start()
             self.step += 1
-            share = self.share  # of a budget in steps, with this one; of one in seconds, what was spent before
+            # of a budget in steps, with this one; of one in seconds, what was spent before
+            share = self.share
             steps = self.schedule.last_step(self.step, self.seconds)
             for group in self.optimizer.param_groups:
                 group["lr"] = group["rate"] * self.schedule.rate(group["name"], share, steps)
-            self.order = self.order or self.order_generator.permutation(len(self.views.names)).tolist()
+            self.order = (
+                self.order or self.order_generator.permutation(len(self.views.names)).tolist()
+            )
             figures = self._step(self.order.pop(), share)
             self._adapt(share)
             self.laps.mark("growth and pruning")
@@ -100,10 +110,14 @@ class Trainer:
     def _adapt(self, share: float) -> None:
         """Growth, pruning, the freeze and refreshes that are due after a step."""
         due = self.step % self.settings.refresh_every == 0
-        frozen = self.schedule.freezes_bands(share)  # a training of few steps does not catch up on growth
+        # a training of few steps does not catch up on growth
+        frozen = self.schedule.freezes_bands(share)
         growing = not frozen and self.schedule.grown(share) > self.population.n_grown
-        removing = growing or (self.schedule.has_grown(share) and self.step % self.settings.remove_every == 0)
-        if growing or due or isinstance(self.model, PrintedScene):  # whose regions need finite Gaussians
+        removing = growing or (
+            self.schedule.has_grown(share) and self.step % self.settings.remove_every == 0
+        )
+        # whose regions need finite Gaussians
+        if growing or due or isinstance(self.model, PrintedScene):
             self._drop_broken()
         mask = self._soft_mask(share) if removing else None
         if growing:
@@ -150,7 +164,9 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on as the trainer whose `state_dict()` this is; that one is not to be used afterwards."""
+        """Go on as the trainer whose `state_dict()` this is; that one is not to be used
+        afterwards.
+        """
         model = self.model
         model.raw = {name: value.requires_grad_(True) for name, value in state["raw"].items()}
         for name, module in model.modules.items():
@@ -169,17 +185,24 @@ class Trainer:
         if not isinstance(self.model, PrintedScene):  # which has regions of its own at each step
             means = self.model.raw["means"].detach().double().cpu().numpy()
             regions = regions_of(means, self.model.describe)
-            self.members, self.guidance = torch.as_tensor(regions.members).to(self.model.device), None
+            self.members, self.guidance = (
+                torch.as_tensor(regions.members).to(self.model.device),
+                None,
+            )
         self.population.note_distances()
         self.laps.mark("refresh")
 
     def _guided(self, index: Tensor | None) -> Tensor | None:
-        """Weights [V, 3] of the bands' penalty, computed when first wanted after a refresh; None: all alike."""
+        """Weights [V, 3] of the bands' penalty, computed when first wanted after a refresh; None:
+        all alike.
+        """
         if not self.settings.sh_guided:
             return None
         if self.guidance is None:
             self.laps.mark("losses")
-            shN = sh_prune.dense([band.detach() for band in self.model.bands()[1:]], len(self.model))
+            shN = sh_prune.dense(
+                [band.detach() for band in self.model.bands()[1:]], len(self.model)
+            )
             self.guidance = sh_prune.region_guidance(shN, self.members, len(self.model))
             self.laps.mark("refresh")
         return self.guidance if index is None else self.guidance[index]
@@ -190,9 +213,19 @@ class Trainer:
         loss, values = losses["loss"], torch.stack([value.detach() for value in losses.values()])
         figures = dict(zip(losses, values.tolist() if self.reads else values.unbind(), strict=True))
         if self.reads and not math.isfinite(figures["loss"]):
-            bad = [name.removeprefix("loss_") for name, value in figures.items() if not math.isfinite(value)][1:]
-            where = f"step {self.step}, view {self.views.names[index]}: loss {', '.join(bad)} is not finite"
-            raise DataFailure(f"{where}; {broken(self.model) or 'all parameters are finite: look at the view itself'}")
+            bad = [
+                name.removeprefix("loss_")
+                for name, value in figures.items()
+                if not math.isfinite(value)
+            ][1:]
+            where = (
+                f"step {self.step}, view {self.views.names[index]}: loss {', '.join(bad)} is "
+                "not finite"
+            )
+            raise DataFailure(
+                f"{where}; "
+                f"{broken(self.model) or 'all parameters are finite: look at the view itself'}"
+            )
         self.laps.mark("losses")
         self.optimizer.zero_grad(set_to_none=True)
         if settings.densify_semantic:
@@ -209,24 +242,34 @@ class Trainer:
         return figures
 
     def _teaches(self, share: float) -> bool:
-        """Does this step teach features? It looks at a whole photo then, while others look at windows: one in WHOLE at
-        most.
+        """Does this step teach features? It looks at a whole photo then, while others look at
+        windows: one in WHOLE at most.
         """
-        every = max(self.feature_every, WHOLE) if self.schedule.in_full(share) else self.feature_every
+        every = (
+            max(self.feature_every, WHOLE) if self.schedule.in_full(share) else self.feature_every
+        )
         return self.views.features is not None and self.step % every == 0
 
     def _window(self, share: float) -> Window | None:
-        """The part of a photo, drawn at random, that this step sees as it is; None: the whole photo, reduced."""
+        """The part of a photo, drawn at random, that this step sees as it is; None: the whole
+        photo, reduced.
+        """
         if not self.schedule.in_full(share) or self._teaches(share):
             return None
         (height, width), by = self.views.images.shape[1:3], self.schedule.reduction
-        top, left = self.order_generator.integers(0, [height - height // by + 1, width - width // by + 1]).tolist()
+        top, left = self.order_generator.integers(
+            0, [height - height // by + 1, width - width // by + 1]
+        ).tolist()
         return Window(top, left, height // by, width // by)
 
-    def losses_of(self, index: int, share: float, window: Window | None = None) -> tuple[Rendered, dict[str, Tensor]]:
-        """A view as this step looks at it, and its losses: `loss`, their sum, and each, weighted, as `loss_<name>`.
+    def losses_of(
+        self, index: int, share: float, window: Window | None = None
+    ) -> tuple[Rendered, dict[str, Tensor]]:
+        """A view as this step looks at it, and its losses: `loss`, their sum, and each, weighted,
+        as `loss_<name>`.
 
-        Args: index: of the view; share: of the budget that is spent; window: of the photo, None: all of it, reduced.
+        Args: index: of the view; share: of the budget that is spent; window: of the photo, None:
+          all of it, reduced.
         """
         settings, factor = self.settings, self.schedule.factor(share) if window is None else 1
         pruning, taught = self.schedule.prunes(share), self._teaches(share)
@@ -258,29 +301,47 @@ class Trainer:
         }  # fmt: skip
         given = {name: value for name, value in known.items() if value is not None}
         key = factor, tuple(given), labels is not None and labels.complete
-        return rendered, self.model.replay(key, partial(self._losses, *key), [], list(given.values()))
+        return rendered, self.model.replay(
+            key, partial(self._losses, *key), [], list(given.values())
+        )
 
-    def _losses(self, factor: int, names: Sequence[str], complete: bool, *tensors: Tensor) -> dict[str, Tensor]:
+    def _losses(
+        self, factor: int, names: Sequence[str], complete: bool, *tensors: Tensor
+    ) -> dict[str, Tensor]:
         """As `losses_of`, of tensors by their names there (docs/method.md, section 8)."""
-        settings, backend, given = self.settings, self.model.backend, dict(zip(names, tensors, strict=True))
+        settings, backend, given = (
+            self.settings,
+            self.model.backend,
+            dict(zip(names, tensors, strict=True)),
+        )
         target, mask = reduced(given["photo"], given.get("mask"), factor)
         losses = {"color": photometric(given["rgb"], target, mask, WEIGHT_SSIM, backend)}
         if "features" in given:
             labels = None
             if "classes" in given:
-                labels = TaughtLabels(given["classes"], given["confidence"], given["class_codes"], complete)
-            losses["features"] = semantic_loss(given["features"], given["wanted"], labels, mask, settings, backend)
+                labels = TaughtLabels(
+                    given["classes"], given["confidence"], given["class_codes"], complete
+                )
+            losses["features"] = semantic_loss(
+                given["features"], given["wanted"], labels, mask, settings, backend
+            )
         if isinstance(self.model, PrintedScene):
             parts = given.get("soft_mask"), given.get("delta"), given.get("knowledge")
             losses |= auxiliary_losses(parts, (settings.weight_mask, settings.weight_sh))
         else:
             if "soft_mask" in given:
-                losses["mask"] = settings.weight_mask * sh_prune.mean_of(given["soft_mask"], given.get("in_view"))
+                losses["mask"] = settings.weight_mask * sh_prune.mean_of(
+                    given["soft_mask"], given.get("in_view")
+                )
             if "band_masks" in given:
-                cost = sh_prune.sh_loss(given["band_masks"], given.get("guidance"), given.get("in_view"))
+                cost = sh_prune.sh_loss(
+                    given["band_masks"], given.get("guidance"), given.get("in_view")
+                )
                 losses["sh"] = settings.weight_sh * cost
         if "planes" in given:
-            distance = depth_distance(at_pixels(given["planes"]), given["alpha"], given["surface"], mask)
+            distance = depth_distance(
+                at_pixels(given["planes"]), given["alpha"], given["surface"], mask
+            )
             losses["depth"] = self.weight_depth * distance
         loss = torch.stack(list(losses.values())).sum()
         if settings.densify_semantic:  # nobody asks for the gradient of one alone
@@ -289,7 +350,9 @@ class Trainer:
 
     @torch.no_grad()
     def held_in_psnr(self, indices: list[int]) -> float:
-        """Mean PSNR over training views at full resolution, dB, of which a pixel counts; 0 if none does."""
+        """Mean PSNR over training views at full resolution, dB, of which a pixel counts; 0 if none
+        does.
+        """
         scores = []
         for index in indices:
             camera, degree = self.views.camera(index, 1), self.schedule.degree(self.share)
@@ -298,7 +361,9 @@ class Trainer:
             mask = None if self.views.masks is None else self.views.masks[index].cpu().numpy()
             truth = self.views.images[index].cpu().numpy()
             if mask is None or mask.any():
-                scores.append(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
+                scores.append(
+                    psnr(image, truth) if mask is None else psnr(image[mask], truth[mask])
+                )
         return float(np.mean(scores or [0.0]))
 
     @torch.no_grad()
@@ -320,7 +385,9 @@ class Trainer:
 
 
 class Laps:
-    """Seconds by part of the work: each `mark` books the time since the mark or the start before it."""
+    """Seconds by part of the work: each `mark` books the time since the mark or the start before
+    it.
+    """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

@@ -1,4 +1,6 @@
-"""The `chebsplat` command: runs, plans, studies, upkeep, uses of a finished scene, and every stage as a command."""
+"""The `chebsplat` command: runs, plans, studies, upkeep, uses of a finished scene, and every stage
+as a command.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ from chebsplat.stages.runtime.stopping import streams
 
 
 class Commands(Guarded):
-    """Stages are listed from their table and imported only when called, so that --help stays instant."""
+    """Stages are listed from their table and imported only when called, so that --help stays
+    instant.
+    """
 
     def main(self, *arguments: Any, **options: Any) -> Any:
         with streams(say):
@@ -30,7 +34,8 @@ class Commands(Guarded):
         return [*(name for name in super().list_commands(context) if name not in STAGES), *STAGES]
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
-        if name in STAGES and name not in self.commands:  # for the listing, which shows a name and a line
+        # for the listing, which shows a name and a line
+        if name in STAGES and name not in self.commands:
             return click.Command(name, help=STAGES[name].help)
         return super().get_command(context, name)
 
@@ -38,7 +43,8 @@ class Commands(Guarded):
         of_a_file = any(word.startswith("--capture") or is_splat(word) for word in args[1:]) or (
             len(args) > 1 and not args[1].startswith("-")
         )
-        if args[0] in STAGES and not (of_a_file and args[0] in self.commands):  # `lift` is of a file, too
+        # `lift` is of a file, too
+        if args[0] in STAGES and not (of_a_file and args[0] in self.commands):
             from chebsplat.stages.runtime.command import command
 
             return args[0], command(args[0], partial(run_stage, args[0])), args[1:]

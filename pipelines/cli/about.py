@@ -16,7 +16,9 @@ WIDEST = 36  # characters of a column of ranges
 
 @click.command()
 def scenes() -> None:
-    """List the scenes, ablations, sequences and studies that have a name, and scenes whose data must be brought."""
+    """List the scenes, ablations, sequences and studies that have a name, and scenes whose data
+    must be brought.
+    """
     from chebsplat.pipelines.work.scenes import data_of, names
     from chebsplat.pipelines.work.summary import show_rows
 
@@ -24,7 +26,8 @@ def scenes() -> None:
     print(f"scenes: {' '.join(name for name in names('scenes') if name not in needed)}")
     print("scenes of data that is no part of chebsplat:")
     there = {
-        name: "there" if path.is_dir() else f"missing; set {variable}" for name, (variable, path) in needed.items()
+        name: "there" if path.is_dir() else f"missing; set {variable}"
+        for name, (variable, path) in needed.items()
     }
     show_rows([(f"  {name}", str(path), there[name]) for name, (_, path) in needed.items()])
     for kind in ("ablations", "sequences", "studies"):
@@ -54,7 +57,9 @@ def settings(section: str | None) -> None:
         values, meaning, default = range_of(field), field["description"], field.get("default")
         if len(values) > WIDEST:
             values, meaning = "see right", f"{meaning}; one of {values}"
-        shown_default = "-" if default is None else default if isinstance(default, str) else json.dumps(default)
+        shown_default = (
+            "-" if default is None else default if isinstance(default, str) else json.dumps(default)
+        )
         rows.append((key, shown_default, values, meaning))
     show_rows([("setting", "default", "range", "meaning"), *rows])
 
@@ -66,20 +71,31 @@ def range_of(field: dict[str, Any]) -> str:
         return " | ".join(kind["enum"])
     called = {"boolean": "true | false", "array": "list", "object": "table", "string": "text"}
     words: str = called.get(kind["type"], kind["type"])
-    return words + (f", {kind['minimum']:.15g} to {kind['maximum']:.15g}" if "minimum" in kind else "")
+    return words + (
+        f", {kind['minimum']:.15g} to {kind['maximum']:.15g}" if "minimum" in kind else ""
+    )
 
 
 def version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
-    """Of chebsplat, of the packages that its kernels are compiled with, and the commit of a checkout."""
+    """Of chebsplat, of the packages that its kernels are compiled with, and the commit of a
+    checkout.
+    """
     if not wanted or context.resilient_parsing:
         return
 
     from chebsplat.pipelines.running.run import HERE, git_state
 
     state = git_state(HERE)
-    commit = f"commit {state['commit'][:10]}{' with changes' if state['dirty'] else ''}, " if state else ""
+    commit = (
+        f"commit {state['commit'][:10]}{' with changes' if state['dirty'] else ''}, "
+        if state
+        else ""
+    )
     packages = ", ".join(f"{name} {metadata.version(name)}" for name in ("torch", "numba"))
-    print(f"chebsplat {metadata.version('chebsplat')}, {commit}{packages}, Python {sys.version.split()[0]}")
+    print(
+        f"chebsplat {metadata.version('chebsplat')}, {commit}{packages}, Python "
+        f"{sys.version.split()[0]}"
+    )
     context.exit()
 
 

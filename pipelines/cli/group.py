@@ -1,5 +1,6 @@
-"""Logging and exit codes of commands: the log goes to stderr; what a command returns is its exit code; a typed
-error or a stop becomes a line on stderr and a code. Options that several commands take.
+"""Logging and exit codes of commands: the log goes to stderr; what a command returns is its exit
+code; a typed error or a stop becomes a line on stderr and a code. Options that several commands
+take.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ class _Lines(logging.Formatter):
 
 @contextmanager
 def logged(context: click.Context) -> Iterator[None]:
-    """Send the log to stderr within; a stage that is run there says it in its own way from then on."""
+    """Send the log to stderr within; a stage that is run there says it in its own way from then
+    on.
+    """
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Lines(context))
     logging.getLogger("chebsplat").setLevel("INFO")
@@ -64,7 +67,9 @@ class Guarded(click.Group):
 
 
 class NewPath(click.ParamType):
-    """A file, of one of these suffixes where there are any, or a folder: made, never written over."""
+    """A file, of one of these suffixes where there are any, or a folder: made, never written
+    over.
+    """
 
     name = "path"
 
@@ -96,7 +101,10 @@ class Upward(click.ParamType):
             found = -found if sign == "-" else found
         length = np.linalg.norm(found)
         if found.shape != (3,) or not 0 < length < np.inf:
-            raise ConfigError(f"--up {value}: x, y or z with a sign, three numbers such as 0,0,1, or auto is needed")
+            raise ConfigError(
+                f"--up {value}: x, y or z with a sign, three numbers such as 0,0,1, "
+                "or auto is needed"
+            )
         return found / length
 
 
@@ -112,7 +120,8 @@ class Phrases(click.ParamType):
 UP = click.option(
     "--up",
     type=Upward(),
-    help="against gravity: x, -y, three numbers with commas, or auto (by the cameras, else by the floor)",
+    help="against gravity: x, -y, three numbers with commas, or auto (by the cameras, else by the "
+    "floor)",
 )
 AGAINST = click.option(
     "--against",

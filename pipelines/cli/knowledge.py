@@ -1,4 +1,6 @@
-"""What scenes start from: the lessons of a set, what each is trusted, taking one out, and a new encoder."""
+"""What scenes start from: the lessons of a set, what each is trusted, taking one out, and a new
+encoder.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +12,16 @@ import click
 from chebsplat.pipelines.cli.group import NewPath
 from chebsplat.pipelines.work.heads import ROOMS
 
-NAME = click.option("--set", "name", default=ROOMS, show_default=True, help="of lessons, in the work folder")
+NAME = click.option(
+    "--set", "name", default=ROOMS, show_default=True, help="of lessons, in the work folder"
+)
 
 
 @click.group()
 def knowledge() -> None:
-    """What scenes start from, and what they have taught: show, verify, forget, rebuild; teach a new encoder."""
+    """What scenes start from, and what they have taught: show, verify, forget, rebuild; teach a new
+    encoder.
+    """
 
 
 @knowledge.command()
@@ -64,7 +70,9 @@ def verify(name: str) -> None:
 @click.argument("lesson")
 @NAME
 def forget(lesson: str, name: str) -> None:
-    """Take a LESSON out of a set: scenes that are pinned from now on start as if it had never been learned."""
+    """Take a LESSON out of a set: scenes that are pinned from now on start as if it had never been
+    learned.
+    """
     from chebsplat.pipelines.work import heads
 
     heads.forget(name, lesson)
@@ -75,7 +83,9 @@ def forget(lesson: str, name: str) -> None:
 @NAME
 @click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
 def rebuild(name: str, cores: int) -> int:
-    """Learn every lesson of a set again, by the encoder that ships now, from artifacts that are there."""
+    """Learn every lesson of a set again, by the encoder that ships now, from artifacts that are
+    there.
+    """
     from chebsplat.pipelines.planning.plan import Planner
     from chebsplat.pipelines.planning.sequences import relearning
     from chebsplat.pipelines.running.run import execute
@@ -89,12 +99,16 @@ def rebuild(name: str, cores: int) -> int:
 
 
 @knowledge.command()
-@click.option("--teacher", type=click.Path(path_type=Path), help=".onnx; default: the embedded teacher")
+@click.option(
+    "--teacher", type=click.Path(path_type=Path), help=".onnx; default: the embedded teacher"
+)
 @click.option("--set", "settings", default="", help="section.key=value,... of teach and channels")
 @click.option("--out", type=NewPath(), help="folder to copy it to; later: --knowledge FOLDER/")
 @click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
 def teach(teacher: Path | None, settings: str, out: Path | None, cores: int) -> int:
-    """Teach an encoder what shapes look like to a TEACHER, over generated rooms; its scenes start from it."""
+    """Teach an encoder what shapes look like to a TEACHER, over generated rooms; its scenes start
+    from it.
+    """
     from chebsplat.formats import artifact
     from chebsplat.pipelines.planning.plan import Planner
     from chebsplat.pipelines.planning.sequences import teaching
@@ -117,18 +131,26 @@ def teach(teacher: Path | None, settings: str, out: Path | None, cores: int) -> 
 
 @click.command("teach")
 @click.argument("scene")
-@click.option("--points", type=click.Path(path_type=Path), required=True, help="a CSV of x, y, z, word in its frame")
+@click.option(
+    "--points",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="a CSV of x, y, z, word in its frame",
+)
 @NAME
 @click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
 def teach_points(scene: str, points: Path, name: str, cores: int) -> int:
-    """Teach other scenes what labelled points of a SCENE are: its lesson is of these, in place of its teacher's.
+    """Teach other scenes what labelled points of a SCENE are: its lesson is of these, in place of
+    its teacher's.
 
     Without a SCENE, the stage of this name: --help says more.
     """
     from chebsplat.pipelines.running.run import execute
     from chebsplat.pipelines.selection import checked_stage, plans
 
-    chosen = plans(scene, None, {"learn": {"points": str(points)}}, "", running=True, knowledge=name)
+    chosen = plans(
+        scene, None, {"learn": {"points": str(points)}}, "", running=True, knowledge=name
+    )
     return execute(chosen, checked_stage("learn", chosen), cores)
 
 

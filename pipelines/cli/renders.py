@@ -16,14 +16,19 @@ from chebsplat.formats.splats import is_splat
 from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath
 
 PATH = click.option(
-    "--path", default="capture", show_default=True, help="orbit, capture, or a cameras.json or transforms.json"
+    "--path",
+    default="capture",
+    show_default=True,
+    help="orbit, capture, or a cameras.json or transforms.json",
 )
 FRAMES = click.option(
     "--frames",
     type=click.IntRange(1, 100_000),
     help="of an orbit (default: 120), or of a flight through other cameras (default: none)",
 )
-SIZE = click.option("--size", help="WIDTHxHEIGHT in pixels, such as 1280x960; default: the cameras' own")
+SIZE = click.option(
+    "--size", help="WIDTHxHEIGHT in pixels, such as 1280x960; default: the cameras' own"
+)
 SH = click.option(
     "--sh",
     type=click.IntRange(0, 1),
@@ -43,16 +48,35 @@ WORDS = click.option(
 @PATH
 @FRAMES
 @UP
-@click.option("--what", default="color", show_default=True, help="of color,labels,depth,relevancy; with commas")
+@click.option(
+    "--what",
+    default="color",
+    show_default=True,
+    help="of color,labels,depth,relevancy; with commas",
+)
 @click.option("--query", help="words that relevancy is of")
 @AGAINST
 @SIZE
-@click.option("--fps", type=click.IntRange(1, 240), default=24, show_default=True, help="of a video")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="a folder of frames, or a .mp4")
+@click.option(
+    "--fps", type=click.IntRange(1, 240), default=24, show_default=True, help="of a video"
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="a folder of frames, or a .mp4"
+)
 def render(
-    scene: str, path: str, frames: int | None, up: Any, what: str, size: str | None, fps: int, out: Path, **asked: Any
+    scene: str,
+    path: str,
+    frames: int | None,
+    up: Any,
+    what: str,
+    size: str | None,
+    fps: int,
+    out: Path,
+    **asked: Any,
 ) -> None:
-    """Render a finished SCENE along a path of cameras, as frames or a video; frames that are there are kept."""
+    """Render a finished SCENE along a path of cameras, as frames or a video; frames that are there
+    are kept.
+    """
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.pipelines.api import load
     from chebsplat.pipelines.work.finished import artifact_of
@@ -78,15 +102,23 @@ def render(
 @FRAMES
 @UP
 @SIZE
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="the folder to write into")
-def cameras(scene: str, path: str, frames: int | None, up: Any, size: str | None, out: Path) -> None:
-    """Write the cameras of a SCENE as COLMAP's text model, transforms.json and 3DGS' cameras.json."""
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, help="the folder to write into"
+)
+def cameras(
+    scene: str, path: str, frames: int | None, up: Any, size: str | None, out: Path
+) -> None:
+    """Write the cameras of a SCENE as COLMAP's text model, transforms.json and 3DGS'
+    cameras.json.
+    """
     from chebsplat.pipelines.api import load
     from chebsplat.stages.tools.camera_files import write_cameras
     from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
 
     pixels = size_of(size)
-    for file in write_cameras(out, [fitted(camera, pixels) for camera in path_of(load(scene), path, frames, up)]):
+    for file in write_cameras(
+        out, [fitted(camera, pixels) for camera in path_of(load(scene), path, frames, up)]
+    ):
         print(file.absolute())
 
 
@@ -98,7 +130,9 @@ def cameras(scene: str, path: str, frames: int | None, up: Any, size: str | None
 @AGAINST
 @UP
 def page(scene: str, out: Path, sh: int, words: Path | None, against: list[str], up: Any) -> None:
-    """Write a finished SCENE (or a splat) as one HTML page to fly through and ask in words: no server, no network."""
+    """Write a finished SCENE (or a splat) as one HTML page to fly through and ask in words: no
+    server, no network.
+    """
     _write_page(scene, out, sh, words, against, up)
 
 
@@ -132,7 +166,9 @@ def _name(scene: str) -> str:
     return path.stem if path.suffix and is_splat(scene) else path.name
 
 
-def _write_page(scene: str, out: Path, sh: int, words: Path | None, against: list[str], up: Any) -> None:
+def _write_page(
+    scene: str, out: Path, sh: int, words: Path | None, against: list[str], up: Any
+) -> None:
     """Write the page and say where it is."""
     from chebsplat.formats.scene import Scene
     from chebsplat.formats.teacher_model import read_label_set

@@ -1,4 +1,6 @@
-"""Running and planning: scenes, sequences, studies, and the one step that is a job of Snakemake's."""
+"""Running and planning: scenes, sequences, studies, and the one step that is a job of
+Snakemake's.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +19,29 @@ OPTIONS = [
     click.option("--sequence", help="scenes in order, each with what those before it taught"),
     click.option("--set", "settings", default="", help="section.key=value,..."),
     click.option(
-        "--quality", default="", help="of photos: draft (640 pixels, as by default), standard (1000), high (1600)"
+        "--quality",
+        default="",
+        help="of photos: draft (640 pixels, as by default), standard (1000), high (1600)",
     ),
     click.option("--ablation", default="", help="a named set of settings"),
-    click.option("--knowledge", default="", help="what it starts from: none, shipped, a set of lessons, a folder/"),
-    click.option("--newer", is_flag=True, help="start from the lessons that there are now, and stay with these"),
+    click.option(
+        "--knowledge",
+        default="",
+        help="what it starts from: none, shipped, a set of lessons, a folder/",
+    ),
+    click.option(
+        "--newer",
+        is_flag=True,
+        help="start from the lessons that there are now, and stay with these",
+    ),
 ]
 
 
 ON = click.option(
-    "--on", default="local", show_default=True, help="local, slurm, or the folder/ of a Snakemake profile"
+    "--on",
+    default="local",
+    show_default=True,
+    help="local, slurm, or the folder/ of a Snakemake profile",
 )
 ON_DEVICE = click.option("--device", type=click.Choice(DEVICES), default="auto", show_default=True)
 
@@ -41,7 +56,9 @@ def with_scene(command: Any) -> Any:
 @click.command()
 @with_scene
 @click.option("--stage", help="stop after this stage")
-@click.option("--cores", type=click.IntRange(1), help="default: all; on a cluster, 4 of a node for each job")
+@click.option(
+    "--cores", type=click.IntRange(1), help="default: all; on a cluster, 4 of a node for each job"
+)
 @ON_DEVICE
 @ON
 def run(stage: str | None, cores: int | None, device: str, on: str, **choice: Any) -> int:
@@ -78,7 +95,9 @@ def plan(device: str, **choice: Any) -> None:
 @click.command()
 @click.argument("name")
 @click.option(
-    "--cores", type=click.IntRange(1), help="shared by the jobs that run at once; default: all, or of 100 jobs"
+    "--cores",
+    type=click.IntRange(1),
+    help="shared by the jobs that run at once; default: all, or of 100 jobs",
 )
 @click.option("--threads", type=click.IntRange(1), default=2, show_default=True, help="of each job")
 @click.option("--out", type=click.Path(path_type=Path), help="default: build/studies/NAME")
@@ -87,9 +106,18 @@ def plan(device: str, **choice: Any) -> None:
 @ON_DEVICE
 @ON
 def study(
-    name: str, cores: int | None, threads: int, out: Path | None, only_plan: bool, no_run: bool, device: str, on: str
+    name: str,
+    cores: int | None,
+    threads: int,
+    out: Path | None,
+    only_plan: bool,
+    no_run: bool,
+    device: str,
+    on: str,
 ) -> int:
-    """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on where it stopped."""
+    """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on
+    where it stopped.
+    """
     from chebsplat.pipelines.running import cluster
     from chebsplat.pipelines.running.run import Outcome, device_of, say
     from chebsplat.pipelines.studies import page, published, results, tables
@@ -99,7 +127,10 @@ def study(
     computing = device_of(device, where)
     cores = cores or (os.cpu_count() or 1 if where == cluster.LOCAL else 100 * threads)
     runs = studies.expand(asked, running=not (only_plan or no_run), device=computing)
-    say(f"{name}: {len(runs)} runs, {sum(run.plan.targets['evaluate'].is_dir() for run in runs)} of them done")
+    say(
+        f"{name}: {len(runs)} runs, {sum(run.plan.targets['evaluate'].is_dir() for run in runs)} "
+        "of them done"
+    )
     if only_plan:
         print(studies.describe(studies.outstanding(runs)))
         return 0
@@ -115,7 +146,9 @@ def study(
 
     outcome = Outcome()
     if not no_run:
-        outcome = studies.execute(Path(name).stem, runs, cores, used, computing, where, lambda: write({}))
+        outcome = studies.execute(
+            Path(name).stem, runs, cores, used, computing, where, lambda: write({})
+        )
     print(write(outcome.failed))
     return outcome.code
 
@@ -123,7 +156,9 @@ def study(
 @click.command(hidden=True)
 @click.argument("plan", type=click.Path(path_type=Path))
 @click.argument("keys", nargs=-1, required=True)
-@click.option("--elsewhere", is_flag=True, help="on a node of a cluster, which no pipe of the run reaches")
+@click.option(
+    "--elsewhere", is_flag=True, help="on a node of a cluster, which no pipe of the run reaches"
+)
 def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
     """Steps of a plan, one after the other until one fails, as Snakemake runs them."""
     from chebsplat.pipelines.running import job as jobs
@@ -132,7 +167,9 @@ def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
 
     jobs.use_threads()
     if len(keys) > 1:
-        return in_turn(_main, [["job", *["--elsewhere"] * elsewhere, str(plan), key] for key in keys])
+        return in_turn(
+            _main, [["job", *["--elsewhere"] * elsewhere, str(plan), key] for key in keys]
+        )
     if elsewhere:
         watch_run(plan)
     return jobs.run(plan, keys[0], again=elsewhere)
@@ -150,7 +187,9 @@ def rehearse(semantic: bool) -> int:
 
 
 def _main(arguments: list[str]) -> None:
-    """Our command in a process that was forked for it; by name, since it is the command that holds those of here."""
+    """Our command in a process that was forked for it; by name, since it is the command that holds
+    those of here.
+    """
     import_module("chebsplat.pipelines.cli").main(arguments, prog_name="chebsplat")
 
 

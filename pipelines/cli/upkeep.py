@@ -19,7 +19,9 @@ class Age(click.ParamType):
 
     name = "age"
 
-    def convert(self, value: Any, param: click.Parameter | None, context: click.Context | None) -> float:
+    def convert(
+        self, value: Any, param: click.Parameter | None, context: click.Context | None
+    ) -> float:
         if isinstance(value, float):
             return value
         if not (found := re.fullmatch(r"(\d{1,6})([mhdw])", value)):
@@ -29,7 +31,9 @@ class Age(click.ParamType):
 
 @click.command("ls")
 def list_scenes() -> None:
-    """List scenes, studies and sequences in work: source, stages done, bytes, when, and what was measured."""
+    """List scenes, studies and sequences in work: source, stages done, bytes, when, and what was
+    measured.
+    """
     from chebsplat.pipelines.work import inventory, store
     from chebsplat.pipelines.work.summary import show_rows
 
@@ -52,7 +56,10 @@ def rm(scenes: tuple[str, ...], yes: bool) -> None:
     artifacts = inventory.only_of(chosen)
     for folder in chosen:
         foreign = inventory.others(folder)
-        print(f"           {folder}" + (f" (stays, for what is not ours: {', '.join(foreign)})" if foreign else ""))
+        print(
+            f"           {folder}"
+            + (f" (stays, for what is not ours: {', '.join(foreign)})" if foreign else "")
+        )
     show_sizes(artifacts, yes, "--yes removes them")
     if yes:
         remove(chosen, artifacts)
@@ -69,7 +76,9 @@ def remove(chosen: list[Path], artifacts: list[tuple[Path, int]]) -> None:
 
 
 def show_sizes(sizes: list, done: bool, advice: str) -> None:
-    """Print folders with their sizes in MB, and the total; `advice` says what to do, unless it is done."""
+    """Print folders with their sizes in MB, and the total; `advice` says what to do, unless it is
+    done.
+    """
     for path, size in sizes:
         print(f"{size / 2**20:9.1f} MB  {path}")
     total = sum(size for _, size in sizes) / 2**20
@@ -96,15 +105,23 @@ def verify(scenes: tuple[str, ...]) -> int:
 
 @click.command("clean-stale")
 @click.option("--yes", is_flag=True, help="remove what is listed")
-@click.option("--keep-newer", type=Age(), default=0.0, help="spare what is younger: 30m, 12h, 7d, 4w")
-@click.option("--older-than", type=Age(), help="give up scenes and studies, too, that nothing was added to for so long")
+@click.option(
+    "--keep-newer", type=Age(), default=0.0, help="spare what is younger: 30m, 12h, 7d, 4w"
+)
+@click.option(
+    "--older-than",
+    type=Age(),
+    help="give up scenes and studies, too, that nothing was added to for so long",
+)
 def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
     """List the artifacts that no scene names any more, and leftovers of killed runs."""
     from chebsplat.pipelines.work import inventory, store
 
     old = [] if older_than is None else inventory.untouched(older_than)
     leftovers = store.unnamed(set(old))
-    leftovers = [(path, size) for path, size in leftovers if not keep_newer or store.age(path) >= keep_newer]
+    leftovers = [
+        (path, size) for path, size in leftovers if not keep_newer or store.age(path) >= keep_newer
+    ]
     for folder in old:
         print(f"           {folder}")
     show_sizes(leftovers, yes or not (leftovers or old), "yes=1 (--yes) removes them")
@@ -115,7 +132,9 @@ def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
 
 @click.command()
 def status() -> None:
-    """Say what runs, waits and has failed, with seconds and the end of the log, here and on a cluster."""
+    """Say what runs, waits and has failed, with seconds and the end of the log, here and on a
+    cluster.
+    """
     from chebsplat.pipelines.work import store
     from chebsplat.pipelines.work.summary import lines
 

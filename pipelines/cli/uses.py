@@ -25,9 +25,13 @@ def told(figures: Mapping[str, Any], out: Path) -> None:
 @click.argument("scene")
 @click.argument("text")
 @AGAINST
-@click.option("--top", type=click.IntRange(1), default=8, show_default=True, help="labels in the table")
+@click.option(
+    "--top", type=click.IntRange(1), default=8, show_default=True, help="labels in the table"
+)
 def query(scene: str, text: str, against: list[str], top: int) -> None:
-    """Is TEXT, such as "something to sit on", in a finished SCENE, and how likely are its Gaussians that, by label?"""
+    """Is TEXT, such as "something to sit on", in a finished SCENE, and how likely are its Gaussians
+    that, by label?
+    """
     from chebsplat.pipelines.api import load
     from chebsplat.stages.tools.query import table
 
@@ -57,10 +61,22 @@ def check_teacher(model: Path, photos: tuple[Path, ...], labels: str | None) -> 
 
 @click.command("get-teacher")
 @click.argument("name")
-@click.option("--out", type=click.Path(path_type=Path), help="folder to make; default: called like the teacher, here")
-@click.option("--file", "graph", default="onnx/model.onnx", show_default=True, help="the ONNX file in the repository")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="folder to make; default: called like the teacher, here",
+)
+@click.option(
+    "--file",
+    "graph",
+    default="onnx/model.onnx",
+    show_default=True,
+    help="the ONNX file in the repository",
+)
 def get_teacher(name: str, out: Path | None, graph: str) -> None:
-    """Fetch a segmenter from the Hugging Face hub as a teacher: segformer-b0-ade, or hf:OWNER/NAME[@REVISION]."""
+    """Fetch a segmenter from the Hugging Face hub as a teacher: segformer-b0-ade, or
+    hf:OWNER/NAME[@REVISION].
+    """
     from chebsplat.stages.tools.get_teacher import get_teacher as fetch
 
     model, findings = fetch(name, out, graph)
@@ -73,10 +89,14 @@ def get_teacher(name: str, out: Path | None, graph: str) -> None:
 @click.command()
 @click.argument("scene")
 @click.option("--out", type=NewPath(), required=True, help="the .ply to write")
-@click.option("--keep-label", "labels", multiple=True, help="a name of labels.json; may be given again")
+@click.option(
+    "--keep-label", "labels", multiple=True, help="a name of labels.json; may be given again"
+)
 @click.option("--min-opacity", type=click.FloatRange(0, 1), default=0.0, help="activated")
 @click.option("--box", help="x0,y0,z0,x1,y1,z1 that centres lie in, scene units")
-@click.option("--query", "text", help="words: what is likelier than not these, in parts that hang together")
+@click.option(
+    "--query", "text", help="words: what is likelier than not these, in parts that hang together"
+)
 @AGAINST
 def extract(
     scene: str,
@@ -101,13 +121,20 @@ def extract(
 
 @click.command()
 @click.argument("ply", type=click.Path(path_type=Path))
-@click.option("--capture", help="a finished scene of the same photos, or an ingest artifact: gives features and labels")
-@click.option("--teacher", type=click.Path(path_type=Path), help=".onnx, with --capture; default: the scene's own")
+@click.option(
+    "--capture",
+    help="a finished scene of the same photos, or an ingest artifact: gives features and labels",
+)
+@click.option(
+    "--teacher",
+    type=click.Path(path_type=Path),
+    help=".onnx, with --capture; default: the scene's own",
+)
 @UP
 @click.option("--out", type=NewPath(), required=True, help="the folder to make")
 def lift(ply: Path, capture: str | None, teacher: Path | None, up: Any, out: Path) -> None:
-    """Make a scene of any splat (.PLY, .spz, .splat, a folder of 3DGS): to render, page and extract from; with
-    --capture, in whose frame it lies, to query, too.
+    """Make a scene of any splat (.PLY, .spz, .splat, a folder of 3DGS): to render, page and extract
+    from; with --capture, in whose frame it lies, to query, too.
 
     Without a .PLY, the stage of this name: --help says more.
     """
@@ -116,7 +143,9 @@ def lift(ply: Path, capture: str | None, teacher: Path | None, up: Any, out: Pat
 
     if capture is None:
         if teacher is not None:
-            raise ConfigError("--teacher looks at photos; add --capture, or label by shape alone: chebsplat label")
+            raise ConfigError(
+                "--teacher looks at photos; add --capture, or label by shape alone: chebsplat label"
+            )
         told(import_ply(ply, out, up), out)
         return
     if up is not None:
@@ -132,7 +161,9 @@ def lift(ply: Path, capture: str | None, teacher: Path | None, up: Any, out: Pat
 @click.option("--rooms", type=int, default=12, show_default=True, help="generated rooms")
 @click.option("--force", is_flag=True, help="replace the calibration that is there")
 def calibrate(model: Path | None, rooms: int, force: bool) -> None:
-    """Find out on generated rooms what the relevancy of a teacher MODEL (.onnx) means; kept beside it, for `query`."""
+    """Find out on generated rooms what the relevancy of a teacher MODEL (.onnx) means; kept beside
+    it, for `query`.
+    """
     from chebsplat.formats.calibration import beside, write_calibration
     from chebsplat.formats.teacher_model import EMBEDDED
     from chebsplat.stages.runtime.progress import Progress
@@ -150,13 +181,45 @@ def calibrate(model: Path | None, rooms: int, force: bool) -> None:
 
 @click.command()
 @click.argument("ply", type=click.Path(path_type=Path))
-@click.option("--words", type=Phrases(), help="to choose among, with commas; default: the classes of generated rooms")
-@click.option("--up", type=Upward(), default="z", show_default=True, help="against gravity: -y, 0,0,1, auto, ...")
-@click.option("--unit", type=click.FloatRange(0, min_open=True), help="PLY units in a metre; default: by its extent")
-@click.option("--knowledge", type=click.Path(path_type=Path), help="an artifact; default: the one that is shipped")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="the .ply to write; an .npz beside it")
-def label(ply: Path, words: list[str] | None, up: Any, unit: float | None, knowledge: Path | None, out: Path) -> None:
-    """Name the Gaussians of any .PLY of a room by shape alone, with a confidence: no photo, no 2D teacher."""
+@click.option(
+    "--words",
+    type=Phrases(),
+    help="to choose among, with commas; default: the classes of generated rooms",
+)
+@click.option(
+    "--up",
+    type=Upward(),
+    default="z",
+    show_default=True,
+    help="against gravity: -y, 0,0,1, auto, ...",
+)
+@click.option(
+    "--unit",
+    type=click.FloatRange(0, min_open=True),
+    help="PLY units in a metre; default: by its extent",
+)
+@click.option(
+    "--knowledge",
+    type=click.Path(path_type=Path),
+    help="an artifact; default: the one that is shipped",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    required=True,
+    help="the .ply to write; an .npz beside it",
+)
+def label(
+    ply: Path,
+    words: list[str] | None,
+    up: Any,
+    unit: float | None,
+    knowledge: Path | None,
+    out: Path,
+) -> None:
+    """Name the Gaussians of any .PLY of a room by shape alone, with a confidence: no photo, no 2D
+    teacher.
+    """
     from chebsplat.formats.knowledge import SHIPPED
     from chebsplat.stages.tools.lift_ply import label_ply
     from chebsplat.synthetic import CLASS_NAMES
@@ -171,14 +234,22 @@ def label(ply: Path, words: list[str] | None, up: Any, unit: float | None, knowl
 
 @click.command()
 @click.argument("scene")
-@click.option("--out", type=NewPath(".ply", ".glb"), required=True, help="the .ply or .glb to write")
-@click.option("--voxel", type=click.FloatRange(0, min_open=True), help="edge, scene units; default: 1/250 of the room")
-@click.option("--triangles", type=click.IntRange(4), default=200_000, show_default=True, help="at most")
+@click.option(
+    "--out", type=NewPath(".ply", ".glb"), required=True, help="the .ply or .glb to write"
+)
+@click.option(
+    "--voxel",
+    type=click.FloatRange(0, min_open=True),
+    help="edge, scene units; default: 1/250 of the room",
+)
+@click.option(
+    "--triangles", type=click.IntRange(4), default=200_000, show_default=True, help="at most"
+)
 @click.option("--raw", is_flag=True, help="as it was fused: nothing removed, closed or decimated")
 @UP
 def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool, up: Any) -> None:
-    """Write the surface of a finished SCENE as triangles with colours and labels, in the scene's frame; with --up
-    turned, so that up is z, and y of a .glb.
+    """Write the surface of a finished SCENE as triangles with colours and labels, in the scene's
+    frame; with --up turned, so that up is z, and y of a .glb.
     """
     from chebsplat.formats.meshes import write_mesh
     from chebsplat.pipelines.api import load

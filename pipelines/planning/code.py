@@ -1,9 +1,10 @@
-"""Identity of a step: one digest of all that its result depends on, its code among it, and of nothing else.
+"""Identity of a step: one digest of all that its result depends on, its code among it, and of
+nothing else.
 
-The hash of the code behind a stage covers the syntax trees, without comments and docstrings, of the stage's module
-and of every module of ours it imports, however deep, the templates of pages beside them, and the versions of the
-packages these import. Plumbing that cannot change a result is left out, so that a better progress bar makes nothing
-stale.
+The hash of the code behind a stage covers the syntax trees, without comments and docstrings, of the
+stage's module and of every module of ours it imports, however deep, the templates of pages beside
+them, and the versions of the packages these import. Plumbing that cannot change a result is left
+out, so that a better progress bar makes nothing stale.
 """
 
 from __future__ import annotations
@@ -21,10 +22,15 @@ import chebsplat
 from chebsplat.stages.registry import Stage
 
 PACKAGE = Path(chebsplat.__file__).parent
-PLUMBING = tuple(f"chebsplat.{name}." for name in ("settings", "stages.settings", "stages.registry", "stages.runtime"))
+PLUMBING = tuple(
+    f"chebsplat.{name}."
+    for name in ("settings", "stages.settings", "stages.registry", "stages.runtime")
+)
 TEMPLATES = {".html", ".css", ".js"}  # of a package: what its modules fill
-OPTIONAL = {"av", "gsplat", "pillow_heif", "tokenizers", "transformers"}  # of extras: count where a scene uses them
-# Settings that say where raw files lie. Their content is hashed instead: where it lies is no matter.
+# of extras: count where a scene uses them
+OPTIONAL = {"av", "gsplat", "pillow_heif", "tokenizers", "transformers"}
+# Settings that say where raw files lie. Their content is hashed instead: where it lies is no
+# matter.
 PLACES = (
     ("source", "path"),
     ("ingest", "volumes"),
@@ -40,8 +46,9 @@ PLACES = (
 
 
 class Code:
-    """Reads the modules of ours below `package`, the folder of `chebsplat`. `memo` maps a path to what was found in it
-    at a (mtime, size); the caller keeps it, so that an unchanged file is not parsed again.
+    """Reads the modules of ours below `package`, the folder of `chebsplat`. `memo` maps a path to
+    what was found in it at a (mtime, size); the caller keeps it, so that an unchanged file is not
+    parsed again.
     """
 
     def __init__(self, package: Path, memo: dict[str, list]):
@@ -51,9 +58,11 @@ class Code:
         self._stages: dict[str, dict[str, Any]] = {}
 
     def stage(self, name: str, used: tuple[str, ...] = ()) -> dict[str, Any]:
-        """{"hash": ..., "packages": {name: version}} of stage `name`; read once in this object's life.
+        """{"hash": ..., "packages": {name: version}} of stage `name`; read once in this object's
+        life.
 
-        Args: used: packages of extras that the configuration uses; others of OPTIONAL are no part of the identity.
+        Args: used: packages of extras that the configuration uses; others of OPTIONAL are no part
+          of the identity.
         """
         if name not in self._stages:
             self._stages[name] = self._identity(name)
@@ -72,7 +81,9 @@ class Code:
             digest, imports = self._read(path)
             seen[module] = digest
             if path.name == "__init__.py":
-                templates = (file for file in sorted(path.parent.iterdir()) if file.suffix in TEMPLATES)
+                templates = (
+                    file for file in sorted(path.parent.iterdir()) if file.suffix in TEMPLATES
+                )
                 seen |= {f"{module}/{file.name}": self._read(file)[0] for file in templates}
             for imported in imports:
                 first = imported.partition(".")[0]
@@ -120,14 +131,20 @@ class Code:
 
 
 def _remembers(held: Any, stamp: list[int]) -> bool:
-    """Whether an entry of the memo, which is a file that anything may have happened to, is of this stamp."""
-    if not (isinstance(held, list) and len(held) == 3 and held[0] == stamp and isinstance(held[1], str)):
+    """Whether an entry of the memo, which is a file that anything may have happened to, is of this
+    stamp.
+    """
+    if not (
+        isinstance(held, list) and len(held) == 3 and held[0] == stamp and isinstance(held[1], str)
+    ):
         return False
     return isinstance(held[2], list) and all(isinstance(name, str) for name in held[2])
 
 
 def parsed(text: str, name: str) -> tuple[str, list[str]]:
-    """Digest of a module's syntax tree without docstrings, and the dotted names it imports; of a template's text."""
+    """Digest of a module's syntax tree without docstrings, and the dotted names it imports; of a
+    template's text.
+    """
     if not name.endswith(".py"):
         return hashlib.sha256(text.encode()).hexdigest()[:16], []
     tree = ast.parse(text, name)
@@ -159,7 +176,8 @@ def step_key(
     """Key of a stage's artifact, 16 hex digits.
 
     Args: sections: the config that the stage reads; inputs: keys of artifacts by role;
-          code: of `Code.stage`; raw: `raw.content_hash` of the files outside the store that the stage reads;
+          code: of `Code.stage`; raw: `raw.content_hash` of the files outside the store that the
+            stage reads;
           device: that computes it. The CPU's keys do not name it.
     """
     identity = {

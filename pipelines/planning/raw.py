@@ -1,4 +1,6 @@
-"""Raw files, which stages read outside the store: what a key holds of them, and whether they stayed what they were."""
+"""Raw files, which stages read outside the store: what a key holds of them, and whether they stayed
+what they were.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,14 @@ from chebsplat.formats.images import images_below
 from chebsplat.formats.splats import splat_file
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 
-SETTLED = 2_000_000_000  # ns; no file system's clock is coarser. What changed later than this may yet change unseen
+# ns; no file system's clock is coarser. What changed later than this may yet change unseen
+SETTLED = 2_000_000_000
 Hashes = dict[str, list[Any]]  # path -> [stamp, sha256, whether it was settled when it was read]
 
 
 def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[Path]]:
-    """The files that a stage reads with these settings, and the folder they belong to (None: only names count).
+    """The files that a stage reads with these settings, and the folder they belong to (None: only
+    names count).
 
     Raises: InputError if there are none where there must be.
     """
@@ -72,7 +76,9 @@ def _of_teacher(settings: dict[str, Any]) -> list[Path]:
 
 
 def _of_channels(settings: dict[str, Any]) -> list[Path]:
-    """The model's files, its channel map's where it brings one, and the reference images; none of a scene's."""
+    """The model's files, its channel map's where it brings one, and the reference images; none of a
+    scene's.
+    """
     folder = settings["reference"]
     images = images_below(Path(folder), "correct channels.reference") if folder else []
     teacher = read_teacher(Path(settings["model"]))
@@ -88,16 +94,21 @@ def _named(path: str, setting: str) -> Path:
 def hashes(files: Iterable[Path], memo: dict[str, Any]) -> Hashes:
     """Stamp and content hash of each file; one whose stamp `memo` holds is not read again.
 
-    Choices: the stamp holds the time of the last change of content or name (ctime), which no user can set, unlike that
-      of modification. A file that has changed just now could change again within the same tick of that clock: it is not
-      remembered.
+    Choices: the stamp holds the time of the last change of content or name (ctime), which no user
+      can set, unlike that of modification. A file that has changed just now could change again
+      within the same tick of that clock: it is not remembered.
     """
     entries: Hashes = {}
     for path in files:
         now, state = time.time_ns(), regular(path)
         stamp = [state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns]
         entry = memo.get(str(path))
-        if not (isinstance(entry, list) and len(entry) == 3 and entry[0] == stamp and isinstance(entry[1], str)):
+        if not (
+            isinstance(entry, list)
+            and len(entry) == 3
+            and entry[0] == stamp
+            and isinstance(entry[1], str)
+        ):
             entry = [stamp, sha256_file(path), now - state.st_ctime_ns > SETTLED]
             if entry[2]:
                 memo[str(path)] = entry
@@ -129,7 +140,13 @@ def unchanged(stage: str, sections: dict[str, Any], planned: Hashes) -> Iterator
         now = hashes(raw_files(stage, sections)[1], memo)
         for path in (*planned, *now):
             if path not in now or path not in planned or now[path][1] != planned[path][1]:
-                what = "is gone" if path not in now else "is new" if path not in planned else "has changed"
+                what = (
+                    "is gone"
+                    if path not in now
+                    else "is new"
+                    if path not in planned
+                    else "has changed"
+                )
                 raise InputError(f"{path} {what} since the run was planned; run again")
 
     check()

@@ -12,7 +12,15 @@ from chebsplat.formats import artifact
 from chebsplat.formats.knowledge import SCHEMA, SHIPPED
 from chebsplat.formats.names import unprintable
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
-from chebsplat.pipelines.planning.plan import Learned, Overrides, Plan, Planner, merged, overrides, placed
+from chebsplat.pipelines.planning.plan import (
+    Learned,
+    Overrides,
+    Plan,
+    Planner,
+    merged,
+    overrides,
+    placed,
+)
 from chebsplat.pipelines.work import heads, store
 from chebsplat.pipelines.work.scenes import read_named
 from chebsplat.stages.registry import STAGES
@@ -29,7 +37,9 @@ def scenes_of(name: str) -> list[str]:
     values = read_named("sequences", name)
     scenes = values.get("scenes")
     if set(values) != {"scenes"} or not isinstance(scenes, list) or not 0 < len(scenes) <= LONGEST:
-        raise ConfigError(f'sequence {name}: it says scenes = ["...", ...], at most {LONGEST}, and nothing else')
+        raise ConfigError(
+            f'sequence {name}: it says scenes = ["...", ...], at most {LONGEST}, and nothing else'
+        )
     for scene in scenes:
         if not isinstance(scene, str) or not scene or unprintable(scene):
             raise ConfigError(f"sequence {name}: scenes: {scene!r:.60} is no scene's name")
@@ -37,14 +47,19 @@ def scenes_of(name: str) -> list[str]:
 
 
 def chain(planner: Planner, name: str, settings: Overrides = "", ablation: str = "") -> list[Plan]:
-    """Plans of a sequence's scenes, each with what those before it have taught: their lessons, or in the printed form
-    the bases that the training before has left.
+    """Plans of a sequence's scenes, each with what those before it have taught: their lessons, or
+    in the printed form the bases that the training before has left.
     """
     found: list[Plan] = []
     for number, scene in enumerate(scenes_of(name), start=1):
         earlier = found[-1].targets["train"] if found and ablation == "paper" else None
-        lessons, place = [plan.lesson for plan in found if plan.lesson is not None], f"{Path(name).stem}-{number}-"
-        found.append(planner.plan(scene, settings, ablation, earlier=earlier, place=place, lessons=lessons))
+        lessons, place = (
+            [plan.lesson for plan in found if plan.lesson is not None],
+            f"{Path(name).stem}-{number}-",
+        )
+        found.append(
+            planner.plan(scene, settings, ablation, earlier=earlier, place=place, lessons=lessons)
+        )
     return found
 
 
@@ -56,13 +71,20 @@ def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
     file = (model or EMBEDDED).expanduser().resolve()
     teacher = read_teacher(file)
     if teacher.output != "features":
-        raise ConfigError(f"{teacher.settings}: output is {teacher.output}; knowledge is taught in features")
-    of: dict[str, Any] = {"channels": {"model": str(file)}, "teach": {"model": str(file)} if model else {}}
+        raise ConfigError(
+            f"{teacher.settings}: output is {teacher.output}; knowledge is taught in features"
+        )
+    of: dict[str, Any] = {
+        "channels": {"model": str(file)},
+        "teach": {"model": str(file)} if model else {},
+    }
     config = placed(configs.build(merged(of, overrides(settings)), f"knowledge for {teacher.name}"))
     channels = planner.step(STAGES["channels"], config, {}, {})
     inputs = {"channels": channels.path}
     teach = planner.step(STAGES["teach"], config, inputs, {"channels": channels.key})
-    return Plan(f"knowledge-{teacher.name}", f"knowledge for the teacher {teacher.name}", [channels, teach])
+    return Plan(
+        f"knowledge-{teacher.name}", f"knowledge for the teacher {teacher.name}", [channels, teach]
+    )
 
 
 def relearning(planner: Planner, name: str) -> list[Plan]:
@@ -78,13 +100,22 @@ def relearning(planner: Planner, name: str) -> list[Plan]:
         if record["start"] == start.name:
             continue
         if not all(map(store.is_fresh, made.values())):
-            store.say(f"{record['scene']}: its artifacts are gone; run the scene again, and it is learned anew")
+            store.say(
+                f"{record['scene']}: its artifacts are gone; run the scene again, and it is "
+                "learned anew"
+            )
             continue
         config = configs.build(manifest.config, f"lesson {key}")
         of = {"descriptors": made["descriptors"], "start": start}
-        encode = planner.step(STAGES["encode"], config, of, {role: path.name for role, path in of.items()})
+        encode = planner.step(
+            STAGES["encode"], config, of, {role: path.name for role, path in of.items()}
+        )
         of = made | {"encoding": encode.path, "start": start}
-        learn = planner.step(STAGES["learn"], config, of, {role: path.name for role, path in of.items()})
+        learn = planner.step(
+            STAGES["learn"], config, of, {role: path.name for role, path in of.items()}
+        )
         lesson = Learned(name, learn.path, record["capture"], start.name, record["scene"])
-        found.append(Plan(f"learned-{key}", f"the lesson of {record['scene']}", [encode, learn], {}, lesson))
+        found.append(
+            Plan(f"learned-{key}", f"the lesson of {record['scene']}", [encode, learn], {}, lesson)
+        )
     return found

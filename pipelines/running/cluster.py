@@ -1,8 +1,9 @@
-"""A run on a cluster: what its jobs ask for, which steps go there together, and that they end with the run.
+"""A run on a cluster: what its jobs ask for, which steps go there together, and that they end with
+the run.
 
-Snakemake submits a job, and on its node starts one step after the other, each in a process of its own as on one
-machine. The pipe that ends jobs with their run (processes.py) does not reach another machine: there, a thread
-watches the run's lease on the shared store.
+Snakemake submits a job, and on its node starts one step after the other, each in a process of its
+own as on one machine. The pipe that ends jobs with their run (processes.py) does not reach another
+machine: there, a thread watches the run's lease on the shared store.
 """
 
 from __future__ import annotations
@@ -39,9 +40,10 @@ class Need:
     mem_mb: int  # doubled at each further attempt
 
 
-# Ample: ten times the seconds that were measured at most, three times the memory, since a job that asks for too little
-# is lost, and one that asks for too much begins a little later.
-NEEDS = {  # measured in 18 scenes on two EPYC cores: seconds (median, most); most memory, in office0
+# Ample: ten times the seconds that were measured at most, three times the memory, since a job that
+# asks for too little is lost, and one that asks for too much begins a little later.
+# measured in 18 scenes on two EPYC cores: seconds (median, most); most memory, in office0
+NEEDS = {
     "pose": Need(100, 4000),
     "ingest": Need(10, 2000),  # 21, 49; 306 MB
     "channels": Need(10, 2000),  # 18, 48
@@ -83,7 +85,10 @@ def profile(on: str) -> Path:
         return folder
     folder = Path(on).expanduser().absolute()
     if "/" not in on or not (folder / "config.yaml").is_file():
-        raise ConfigError(f"on={on}: local, slurm, or a folder (with a /) that holds a profile's config.yaml is needed")
+        raise ConfigError(
+            f"on={on}: local, slurm, or a folder (with a /) that holds a profile's "
+            "config.yaml is needed"
+        )
     return folder
 
 
@@ -96,7 +101,9 @@ def checked(on: str) -> str:
         advice = EXTRA if executor == SLURM else f"install snakemake-executor-plugin-{executor}"
         raise ConfigError(f"on={on}: Snakemake's plugin for {executor} is not installed; {advice}")
     if executor == SLURM and shutil.which("sbatch") is None:
-        raise ConfigError(f"on={on}: there is no sbatch on the PATH; run this where jobs are submitted from")
+        raise ConfigError(
+            f"on={on}: there is no sbatch on the PATH; run this where jobs are submitted from"
+        )
     return on
 
 
@@ -114,20 +121,30 @@ def executor_of(on: str) -> str:
 
 
 def arguments(plan: Path, on: str, cores: int, threads: int | None) -> list[str]:
-    """What Snakemake is told of a run beside its profile. Jobs at once: cores // threads, where jobs have threads."""
+    """What Snakemake is told of a run beside its profile. Jobs at once: cores // threads, where
+    jobs have threads.
+    """
     chosen = ["--jobs", str(max(cores // threads, 1))] if threads else []
     if executor_of(on) == SLURM:
-        chosen += ["--slurm-jobname-prefix", submitted(plan), "--slurm-logdir", str(plan.parent / "slurm")]
+        chosen += [
+            "--slurm-jobname-prefix",
+            submitted(plan),
+            "--slurm-logdir",
+            str(plan.parent / "slurm"),
+        ]
     return chosen
 
 
 def jobs_of(entries: list[dict[str, Any]], on: str) -> dict[str, dict[str, Any]]:
     """The jobs of a plan, by name: the keys of their steps in order, and what they ask for.
 
-    Choices: on one machine a step is a job. On a cluster steps of seconds go with the one that they follow.
+    Choices: on one machine a step is a job. On a cluster steps of seconds go with the one that they
+      follow.
     """
     jobs: dict[str, list[dict[str, Any]]] = {}
-    for name, entry in zip(together(entries) if on != LOCAL else map(name_of, entries), entries, strict=True):
+    for name, entry in zip(
+        together(entries) if on != LOCAL else map(name_of, entries), entries, strict=True
+    ):
         jobs.setdefault(name, []).append(entry)
     return {
         name: {
@@ -148,10 +165,12 @@ def name_of(entry: dict[str, Any]) -> str:
 
 
 def together(entries: list[dict[str, Any]]) -> list[str]:
-    """For each step, in their order, the name of the job that it belongs to: that of the job's first step.
+    """For each step, in their order, the name of the job that it belongs to: that of the job's
+    first step.
 
-    Choices: four kinds of jobs, and none waits for one that waits for it: what a capture begins, a teacher that runs a
-      model, a training, and what follows that. A short training goes with what follows it. Other steps go alone.
+    Choices: four kinds of jobs, and none waits for one that waits for it: what a capture begins, a
+      teacher that runs a model, a training, and what follows that. A short training goes with what
+      follows it. Other steps go alone.
     """
     by_path = {entry["path"]: entry for entry in entries}
 
@@ -159,15 +178,21 @@ def together(entries: list[dict[str, Any]]) -> list[str]:
         stage, inputs = entry["stage"], entry["inputs"]
         if stage == "ingest":
             return "capture", entry["path"]
-        if stage == "sfm" or (stage == "teacher" and entry["config"]["teacher"]["kind"] in MODEL_FREE):
+        if stage == "sfm" or (
+            stage == "teacher" and entry["config"]["teacher"]["kind"] in MODEL_FREE
+        ):
             return "capture", inputs["capture"]
         if stage == "train":
             return "train", entry["path"]
-        if before := [by_path[inputs[role]] for role in BESIDE.get(stage, ()) if inputs.get(role) in by_path]:
+        if before := [
+            by_path[inputs[role]] for role in BESIDE.get(stage, ()) if inputs.get(role) in by_path
+        ]:
             return group(before[0])
         if "gaussians" in inputs:
             train = by_path.get(inputs["gaussians"])
-            return ("train" if train and seconds_of(train) <= SHORT else "after"), inputs["gaussians"]
+            return ("train" if train and seconds_of(train) <= SHORT else "after"), inputs[
+                "gaussians"
+            ]
         return stage, entry["path"]
 
     names: dict[tuple[str, str], str] = {}
@@ -192,17 +217,28 @@ def submitted(plan: Path) -> str:
 
 
 def withdraw(plan: Path, on: str) -> None:
-    """Take a run's jobs out of Slurm's queue; those that run are sent SIGTERM. Others see that the run has ended."""
+    """Take a run's jobs out of Slurm's queue; those that run are sent SIGTERM. Others see that the
+    run has ended.
+    """
     if executor_of(on) != SLURM:
         return
-    listed = subprocess.run(["squeue", "--me", "--noheader", "--format=%i %j"], capture_output=True, text=True)
+    listed = subprocess.run(
+        ["squeue", "--me", "--noheader", "--format=%i %j"], capture_output=True, text=True
+    )
     ours = [line.split()[0] for line in listed.stdout.splitlines() if f" {submitted(plan)}" in line]
-    if listed.returncode or (ours and subprocess.run(["scancel", *ours], capture_output=True).returncode):
-        say(f"jobs could not be taken out of the queue; those called {submitted(plan)}... end by themselves")
+    if listed.returncode or (
+        ours and subprocess.run(["scancel", *ours], capture_output=True).returncode
+    ):
+        say(
+            f"jobs could not be taken out of the queue; those called {submitted(plan)}... end by "
+            "themselves"
+        )
 
 
 def watch_run(plan: Path) -> None:
-    """Stop this process, a job on a node, when the run of its plan ends: it lets go of its lease, or falls silent."""
+    """Stop this process, a job on a node, when the run of its plan ends: it lets go of its lease,
+    or falls silent.
+    """
 
     def watch() -> None:
         goes_on = True

@@ -1,4 +1,6 @@
-"""What a process that compiles kernels begins with: one forked from it begins 2.5 processor seconds further on."""
+"""What a process that compiles kernels begins with: one forked from it begins 2.5 processor seconds
+further on.
+"""
 
 from __future__ import annotations
 

@@ -24,9 +24,11 @@ CODE = "{:<4d}"  # of a job, written over in place: a full disk does not keep it
 
 
 def run(plan: Path, key: str, again: bool = False) -> int:
-    """One Snakemake job; returns the exit code of its step, which is written beside the plan, and so is its log.
+    """One Snakemake job; returns the exit code of its step, which is written beside the plan, and
+    so is its log.
 
-    Args: again: it may be another attempt, with more memory. What settings or data do not allow is not tried again.
+    Args: again: it may be another attempt, with more memory. What settings or data do not allow is
+      not tried again.
     """
     _, files = read_step(plan, key)
     exit_file = Path(f"{files}.exit")
@@ -41,8 +43,8 @@ def run(plan: Path, key: str, again: bool = False) -> int:
 
 
 def use_threads() -> None:
-    """To be called before torch and Numba are imported. Snakemake sets OMP_NUM_THREADS to the one thread that a rule
-    declares; a stage may use all cores of the run.
+    """To be called before torch and Numba are imported. Snakemake sets OMP_NUM_THREADS to the one
+    thread that a rule declares; a stage may use all cores of the run.
     """
     if threads := os.environ.get("CHEBSPLAT_THREADS"):
         os.environ |= {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
@@ -55,8 +57,10 @@ def read_step(plan: Path, key: str) -> tuple[dict[str, Any], Path]:
 
 
 def make(plan: Path, key: str) -> None:
-    """Run a step's stage in this process, under its artifact's lease; a twin in another run is waited for. Nothing is
-    done where the artifact is there already: a job whose node was lost begins with its first step again.
+    """Run a step's stage in this process, under its artifact's lease; a twin in another run is
+    waited for. Nothing is
+    done where the artifact is there already: a job whose node was lost begins with its first step
+      again.
 
     Raises: ChebsplatError, Stopped.
     """
@@ -80,7 +84,9 @@ def make(plan: Path, key: str) -> None:
 
 @contextmanager
 def prepared(step: dict[str, Any], hashes: dict[str, Any]) -> Iterator[None]:
-    """What a stage reads stays as it was planned, and the first training on a processor has its kernels."""
+    """What a stage reads stays as it was planned, and the first training on a processor has its
+    kernels.
+    """
     with ExitStack() as entered:
         entered.enter_context(unchanged(step["stage"], step["config"], hashes))
         if step["stage"] == "train" and step["device"] != "cuda":

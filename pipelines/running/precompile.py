@@ -1,7 +1,9 @@
-"""Compiling what a training needs, side by side: the first one on a machine waits half as long for its first step.
+"""Compiling what a training needs, side by side: the first one on a machine waits half as long for
+its first step.
 
-Numba compiles a kernel when it first meets a kind of arguments, one after the other on one core. Here each part of a
-training meets tiny ones, in a process of its own; what it compiles is kept, and found by the training. A run begins
+Numba compiles a kernel when it first meets a kind of arguments, one after the other on one core.
+Here each part of a training meets tiny ones, in a process of its own; what it compiles is kept, and
+found by the training. A run begins
 with it: what comes before a training leaves processors idle.
 """
 
@@ -28,9 +30,26 @@ def rasterizer() -> None:
     from chebsplat.rasterize import rasterize
 
     g = torch.Generator().manual_seed(0)
-    means, quats, scales = torch.randn(N, 3, generator=g), torch.randn(N, 4, generator=g), torch.full((N, 3), 0.1)
-    camera = torch.eye(4)[None], torch.tensor([[[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]]), WIDTH, HEIGHT
-    rasterize(means, quats, scales, torch.full((N,), 0.5), torch.rand(N, 3), *camera, cell_colors=torch.rand(N, 4))
+    means, quats, scales = (
+        torch.randn(N, 3, generator=g),
+        torch.randn(N, 4, generator=g),
+        torch.full((N, 3), 0.1),
+    )
+    camera = (
+        torch.eye(4)[None],
+        torch.tensor([[[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]]),
+        WIDTH,
+        HEIGHT,
+    )
+    rasterize(
+        means,
+        quats,
+        scales,
+        torch.full((N,), 0.5),
+        torch.rand(N, 3),
+        *camera,
+        cell_colors=torch.rand(N, 4),
+    )
 
 
 def adjoints() -> None:
@@ -41,12 +60,22 @@ def adjoints() -> None:
     def none(*shape: int, kind: type = np.float32) -> np.ndarray:
         return np.zeros(shape, kind)
 
-    bins = none(0, kind=np.int32), none(2, kind=np.int64), *(none(0, kind=np.int32),) * 2, none(1, 1, kind=np.int32)
+    bins = (
+        none(0, kind=np.int32),
+        none(2, kind=np.int64),
+        *(none(0, kind=np.int32),) * 2,
+        none(1, 1, kind=np.int32),
+    )
     seen = none(0, kind=np.uint16), none(1, kind=np.int64), np.float32(0.99)
     slopes = none(TILE, TILE, 3), none(TILE // 4, TILE // 4, 4), none(TILE, TILE)
     tiles_adjoint.backward(0, none(1, 2 * TILE), *bins, *seen, *slopes, False)
-    gaussians, camera = (none(0, 3), none(0, 4), none(0, 3)), (np.eye(4), np.eye(3), TILE, TILE, 0.3)
-    ellipses.project_adjoint(*gaussians, *camera, none(0, kind=np.int32), none(0, 2), none(0, 3), none(0))
+    gaussians, camera = (
+        (none(0, 3), none(0, 4), none(0, 3)),
+        (np.eye(4), np.eye(3), TILE, TILE, 0.3),
+    )
+    ellipses.project_adjoint(
+        *gaussians, *camera, none(0, kind=np.int32), none(0, 2), none(0, 3), none(0)
+    )
 
 
 def colors() -> None:
@@ -57,7 +86,9 @@ def colors() -> None:
 
     bands = [torch.randn(N, 2 * band + 1, 3, requires_grad=True) for band in range(4)]
     for masks in (torch.ones(N, 3, requires_grad=True), None):
-        colors_in_view(bands, masks, torch.arange(N), torch.randn(N, 3), torch.zeros(3), 3).sum().backward()
+        colors_in_view(
+            bands, masks, torch.arange(N), torch.randn(N, 3), torch.zeros(3), 3
+        ).sum().backward()
 
 
 def losses() -> None:
@@ -78,10 +109,23 @@ def lifting() -> None:
     from chebsplat.rasterize.lift import lift
 
     rng = np.random.default_rng(0)
-    means, flat = rng.normal((0, 0, 3), 1, (4 * N, 3)).astype(np.float32), np.ones((4 * N, 3), np.float32)
-    quats, K = rng.normal(size=(4 * N, 4)).astype(np.float32), np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]])
+    means, flat = (
+        rng.normal((0, 0, 3), 1, (4 * N, 3)).astype(np.float32),
+        np.ones((4 * N, 3), np.float32),
+    )
+    quats, K = (
+        rng.normal(size=(4 * N, 4)).astype(np.float32),
+        np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]),
+    )
     cells = np.ones((HEIGHT // 4, WIDTH // 4, CHANNELS), np.float32)
-    said = lift((means, quats, 0.1 * flat, 0.5 * flat[:, 0]), np.eye(4), K, (WIDTH, HEIGHT), cells, cells[..., 0])
+    said = lift(
+        (means, quats, 0.1 * flat, 0.5 * flat[:, 0]),
+        np.eye(4),
+        K,
+        (WIDTH, HEIGHT),
+        cells,
+        cells[..., 0],
+    )
     estimate(gathered(4 * N, CHANNELS, [said]), 1)
 
 
@@ -89,25 +133,34 @@ def descriptors() -> None:
     """Descriptors of points, which follow a training."""
     from chebsplat.shape.point_inputs import point_inputs
 
-    means, shapes = np.random.default_rng(0).normal(0, 1, (4 * N, 3)), np.tile(np.eye(3), (4 * N, 1, 1))
+    means, shapes = (
+        np.random.default_rng(0).normal(0, 1, (4 * N, 3)),
+        np.tile(np.eye(3), (4 * N, 1, 1)),
+    )
     point_inputs(means, np.tile([0.0, 0, 1], (4 * N, 1)), shapes, up=np.array([0, 0, 1.0]))
 
 
 NEEDED = (colors, losses, adjoints, rasterizer)  # of any training
 SEMANTIC = (lifting, descriptors)  # of one that is taught features
-SIDE_BY_SIDE = (rasterizer, lifting), (adjoints,), (losses, colors)  # a lift has the kernels of a picture in it
+# a lift has the kernels of a picture in it
+SIDE_BY_SIDE = (rasterizer, lifting), (adjoints,), (losses, colors)
 
 
 @contextmanager
 def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
-    """Within, what a training needs has been compiled; what follows a semantic one has been when the block ends.
+    """Within, what a training needs has been compiled; what follows a semantic one has been when
+    the block ends.
 
-    Choices: nothing is done where all is kept already or nothing can be, and with one thread. Where another process is
-      at it, this one takes what is left to take, and waits for the rest.
+    Choices: nothing is done where all is kept already or nothing can be, and with one thread. Where
+      another process is at it, this one takes what is left to take, and waits for the rest.
     """
     from chebsplat.kernels.jit import FOLDER
 
-    if FOLDER is None or n_threads < 2 or all(is_kept(part) for part in (*NEEDED, *SEMANTIC * semantic)):
+    if (
+        FOLDER is None
+        or n_threads < 2
+        or all(is_kept(part) for part in (*NEEDED, *SEMANTIC * semantic))
+    ):
         yield
         return
     before, behind = (*NEEDED, *SEMANTIC[:1] * semantic), SEMANTIC[1:] * semantic
@@ -126,7 +179,9 @@ def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
 
 @contextmanager
 def beside(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
-    """A process that rehearses parts, and ends with the block; forked from one that is ready to compile."""
+    """A process that rehearses parts, and ends with the block; forked from one that is ready to
+    compile.
+    """
     context = get_context("forkserver")
     context.set_forkserver_preload(["chebsplat.pipelines.running.compiler"])
     process = context.Process(target=alone, args=(5, *parts), daemon=True)
@@ -139,7 +194,9 @@ def beside(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
 
 
 def alone(niceness: int, *parts: Callable[[], None]) -> None:
-    """Rehearse parts in a process of its own, which gives way to others and ends with the one that asked for it."""
+    """Rehearse parts in a process of its own, which gives way to others and ends with the one that
+    asked for it.
+    """
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.nice(niceness)
     for part in parts:
@@ -154,7 +211,9 @@ def _end_with_parent() -> None:
 
 
 def once(part: Callable[[], None]) -> None:
-    """Rehearse a part unless that was done; another process that is at it is waited for, where files can be locked."""
+    """Rehearse a part unless that was done; another process that is at it is waited for, where
+    files can be locked.
+    """
     with open(_lock(part), "w") as lock:
         with suppress(OSError):
             fcntl.flock(lock, fcntl.LOCK_EX)

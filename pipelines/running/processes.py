@@ -17,9 +17,9 @@ from types import FrameType
 from chebsplat.stages.runtime.stopping import PATIENCE
 
 # Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal. Its
-# standard input is a pipe that ends with the run, however that ends: its session is then stopped, and
-# killed if it does not listen. Its cache lies beside its other files, not in the home folder, which may
-# be full or read-only.
+# standard input is a pipe that ends with the run, however that ends: its session is then stopped,
+# and killed if it does not listen. Its cache lies beside its other files, not in the home folder,
+# which may be full or read-only.
 SNAKEMAKE = """
 import atexit, json, os, signal, subprocess, sys, threading, time
 patience, words, beside, cache = float(sys.argv.pop(1)), *(sys.argv.pop(1) for _ in range(3))
@@ -42,12 +42,16 @@ main()
 
 
 def snakemake(
-    words: Path, cache: Path, arguments: list[str], environment: Mapping[str, str], beside: Sequence[str] = ()
+    words: Path,
+    cache: Path,
+    arguments: list[str],
+    environment: Mapping[str, str],
+    beside: Sequence[str] = (),
 ) -> int:
     """Run Snakemake; returns its exit code when it and all that it has started are gone.
 
-    Args: words: a file for what it says; cache: a folder for its own; environment: variables beside our own; beside: a
-      command of ours that runs meanwhile.
+    Args: words: a file for what it says; cache: a folder for its own; environment: variables beside
+      our own; beside: a command of ours that runs meanwhile.
     """
     reader, writer = os.pipe()
     # -P and PYTHONSAFEPATH: a module where the user stands, or in the work folder, is never run
@@ -71,7 +75,9 @@ def snakemake(
 
 @contextmanager
 def paused_together(process: subprocess.Popen[bytes]) -> Iterator[None]:
-    """A terminal's Ctrl-Z, which reaches this process alone, pauses the session of `process` as well."""
+    """A terminal's Ctrl-Z, which reaches this process alone, pauses the session of `process` as
+    well.
+    """
 
     def pause(_number: int, _frame: FrameType | None) -> None:
         os.killpg(process.pid, signal.SIGSTOP)
@@ -100,10 +106,13 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 
 def in_turn(command: Callable[[list[str]], None], calls: list[list[str]]) -> int:
-    """Call a command of ours once for each list of arguments, until one fails; returns its exit code, or 0.
+    """Call a command of ours once for each list of arguments, until one fails; returns its exit
+    code, or 0.
 
-    Each has a process of its own, forked from one that has imported what nearly all of them import and done nothing
-    else: a step then begins 1.3 seconds of a processor sooner, which on a cluster pays for what a job costs.
+    Each has a process of its own, forked from one that has imported what nearly all of them import
+    and done nothing
+    else: a step then begins 1.3 seconds of a processor sooner, which on a cluster pays for what a
+      job costs.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["torch", "numba", "zarr"])

@@ -30,14 +30,17 @@ HERE = Path(__file__).parents[1]  # of the Snakefile
 
 @dataclass
 class Outcome:
-    """Exit code of a run (the highest of its steps'), and which steps failed: key -> (exit code, last word, log)."""
+    """Exit code of a run (the highest of its steps'), and which steps failed: key -> (exit code,
+    last word, log).
+    """
 
     code: int = 0
     failed: dict[str, tuple[int, str, Path]] = field(default_factory=dict)
 
 
 def device_of(wanted: str, on: str = cluster.LOCAL) -> str:
-    """What `--device` means to all jobs of a run; says once why it is not the GPU that is there. Whether a cluster's
+    """What `--device` means to all jobs of a run; says once why it is not the GPU that is there.
+    Whether a cluster's
     nodes have one is for them to say: a job that asks in vain ends with exit code 2.
     """
     if on != cluster.LOCAL and wanted == "cuda":
@@ -48,8 +51,12 @@ def device_of(wanted: str, on: str = cluster.LOCAL) -> str:
     return device
 
 
-def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu", on: str = cluster.LOCAL) -> int:
-    """Bring plans up to date, up to `stage`; prints where the last artifact (the report's page) is on stdout."""
+def execute(
+    plans: list[Plan], stage: str | None, cores: int, device: str = "cpu", on: str = cluster.LOCAL
+) -> int:
+    """Bring plans up to date, up to `stage`; prints where the last artifact (the report's page) is
+    on stdout.
+    """
     steps = {step.key: step for plan in plans for step in wanted_steps(plan, stage, plans)}
     stale = [step for step in steps.values() if not step.fresh]
     for plan in plans:
@@ -59,7 +66,10 @@ def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu
     code = 0
     try:
         if stale:
-            say(f"  to run: {' '.join(step.stage for step in stale)}   fresh: {len(steps) - len(stale)}")
+            say(
+                f"  to run: {' '.join(step.stage for step in stale)}   fresh: "
+                f"{len(steps) - len(stale)}"
+            )
             code = snakemake(stale, cores, device=device, on=on).code
     finally:  # a run that is stopped names what it has finished
         for plan in plans:
@@ -75,14 +85,18 @@ def execute(plans: list[Plan], stage: str | None, cores: int, device: str = "cpu
 
 
 def add_lesson(plan: Plan) -> None:
-    """The lesson of a scene, if its run has made one, joins the set that scenes after it start from."""
+    """The lesson of a scene, if its run has made one, joins the set that scenes after it start
+    from.
+    """
     made = plan.lesson
     if made is not None and made.lessons is not None and store.is_fresh(made.path):
         heads.add(made.lessons, made.path, made.capture, made.start, made.scene)
 
 
 def say_result(plan: Plan, stage: str | None) -> None:
-    """What a scene has come to, and where it lies: the report's page, or what was asked for last."""
+    """What a scene has come to, and where it lies: the report's page, or what was asked for
+    last.
+    """
     last = next(step for step in reversed(plan.steps) if stage in (None, step.stage))
     if last.stage == "report":
         for line in aligned(summary.table(plan.targets["evaluate"])):
@@ -101,22 +115,33 @@ def wanted_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> 
     while waiting:
         step = waiting.pop()
         needed.add(step.key)
-        waiting += [by_path[path] for path in (*step.inputs.values(), *step.after) if path in by_path]
+        waiting += [
+            by_path[path] for path in (*step.inputs.values(), *step.after) if path in by_path
+        ]
     return [step for step in by_path.values() if step.key in needed]
 
 
 def snakemake(
-    steps: list[Step], cores: int, threads: int | None = None, device: str = "cpu", on: str = cluster.LOCAL
+    steps: list[Step],
+    cores: int,
+    threads: int | None = None,
+    device: str = "cpu",
+    on: str = cluster.LOCAL,
 ) -> Outcome:
     """Run these steps; logs of those that fail stay in `work/.plans`.
 
-    Args: threads: of one job, so that cores // threads run at once; `evaluate`, where it measures frames per second,
+    Args: threads: of one job, so that cores // threads run at once; `evaluate`, where it measures
+      frames per second,
           then runs alone. None: every job may use all cores. on: of `cluster.profile`.
     """
     state = git_state(HERE)
     entries = [entry(step, state, device) for step in steps]
     for item in entries:
-        timed = item["stage"] == "evaluate" and item["config"]["evaluate"]["timing_repeats"] > 0 and on == cluster.LOCAL
+        timed = (
+            item["stage"] == "evaluate"
+            and item["config"]["evaluate"]["timing_repeats"] > 0
+            and on == cluster.LOCAL
+        )
         if threads is not None:
             item["threads"] = cores if timed else threads
         else:
@@ -124,14 +149,23 @@ def snakemake(
     with plan_of(entries, on) as plan:
         folder, words = plan.parent, plan.parent / "snakemake.log"
         arguments = ["--workflow-profile", "none", "--profile", str(cluster.profile(on))]
-        arguments += ["--cores", str(cores)] if on == cluster.LOCAL else cluster.arguments(plan, on, cores, threads)
+        arguments += (
+            ["--cores", str(cores)]
+            if on == cluster.LOCAL
+            else cluster.arguments(plan, on, cores, threads)
+        )
         arguments += ["--snakefile", str(HERE / "Snakefile"), "--directory", str(store.work())]
         arguments += ["--config", f"plan={plan.relative_to(store.work())}"]
-        environment = {"CHEBSPLAT_THREADS": str(threads or cores), "CHEBSPLAT_WORK": str(store.work())}
+        environment = {
+            "CHEBSPLAT_THREADS": str(threads or cores),
+            "CHEBSPLAT_WORK": str(store.work()),
+        }
         code: int | None = None
         try:
             beside = rehearsal_command(entries) if on == cluster.LOCAL and cores > 1 else []
-            code = processes.snakemake(words, store.work() / ".snakemake/cache", arguments, environment, beside)
+            code = processes.snakemake(
+                words, store.work() / ".snakemake/cache", arguments, environment, beside
+            )
             return failures(steps, folder, words) if code else Outcome()
         finally:
             if code != 0 and on != cluster.LOCAL:
@@ -144,15 +178,17 @@ def snakemake(
 
 @contextmanager
 def plan_of(entries: list[dict[str, Any]], on: str = cluster.LOCAL) -> Iterator[Path]:
-    """The plan of a run, in a folder of its own with each job's config; as long as the block runs, `clean-stale` on any
-    machine spares what it names.
+    """The plan of a run, in a folder of its own with each job's config; as long as the block runs,
+    `clean-stale` on any machine spares what it names.
     """
     folder = store.work() / ".plans" / f"{uuid.uuid4().hex[:16]}-{os.getpid()}"
     with leases.held(store.run_lease(folder)):
         yield write_plan(folder, entries, cluster.jobs_of(entries, on))
 
 
-def write_plan(folder: Path, entries: list[dict[str, Any]], jobs: dict[str, dict[str, Any]]) -> Path:
+def write_plan(
+    folder: Path, entries: list[dict[str, Any]], jobs: dict[str, dict[str, Any]]
+) -> Path:
     """The file of a plan, in `folder`, which is made anew."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -174,7 +210,10 @@ def failures(steps: list[Step], folder: Path, words: Path) -> Outcome:
         log, exit_file = (folder / f"{step.stage}-{step.key}.{kind}" for kind in ("log", "exit"))
         if code := int(exit_file.read_text()):
             failed[step.key] = (code, last_word(log), log)
-            say(f"{step.stage} {'was stopped' if code > 128 else 'failed'} with exit code {code}; log: {log}")
+            say(
+                f"{step.stage} {'was stopped' if code > 128 else 'failed'} with exit code {code}; "
+                f"log: {log}"
+            )
         elif log.is_file() and not step.fresh:
             failed[step.key], killed = (1, "killed before it could report", log), True
             say(f"{step.stage} was killed before it could report; log: {log}")
@@ -194,10 +233,11 @@ def last_word(log: Path) -> str:
 
 
 def git_state(root: Path) -> dict[str, Any]:
-    """{"commit", "dirty"} of the checkout that the layer `root` belongs to; empty where it is installed.
+    """{"commit", "dirty"} of the checkout that the layer `root` belongs to; empty where it is
+    installed.
 
-    Choices: a repository around an environment that chebsplat is installed in is none of ours: neither is its commit
-      recorded, nor git started in it, which runs what its settings name.
+    Choices: a repository around an environment that chebsplat is installed in is none of ours:
+      neither is its commit recorded, nor git started in it, which runs what its settings name.
     """
     if not (root.parent / ".git").exists():
         return {}
@@ -226,17 +266,35 @@ def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, A
 
 
 def rehearsal_command(entries: list[dict[str, Any]]) -> list[str]:
-    """What compiles kernels while these steps run: nothing, if no training on the processor is among them."""
-    trained = [entry for entry in entries if entry["stage"] == "train" and entry["device"] != "cuda"]
+    """What compiles kernels while these steps run: nothing, if no training on the processor is
+    among them.
+    """
+    trained = [
+        entry for entry in entries if entry["stage"] == "train" and entry["device"] != "cuda"
+    ]
     if not trained:
         return []
     semantic = any("features" in entry["inputs"] for entry in trained)
-    return [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "rehearse", *["--semantic"] * semantic]
+    return [
+        sys.executable,
+        "-P",
+        "-m",
+        "chebsplat.pipelines.cli",
+        "rehearse",
+        *["--semantic"] * semantic,
+    ]
 
 
 def job_command(plan: Path, of_job: dict[str, Any]) -> str:
     """The shell line of a job, its steps one after the other; a signal meets no shell before it."""
-    command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "job", *["--elsewhere"] * of_job["elsewhere"]]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "chebsplat.pipelines.cli",
+        "job",
+        *["--elsewhere"] * of_job["elsewhere"],
+    ]
     return "exec " + shlex.join([*command, str(plan), *of_job["keys"]])
 
 

@@ -34,14 +34,21 @@ from chebsplat.stages.report import LARGEST
 PAGE = Path(__file__).with_name("page.html")  # a jinja2 template; it fetches nothing from anywhere
 NAME = "study.html"
 PICTURE = "error-against-time.png"
-MARKUP = re.compile(r"([\\`*_{}\[\]|~$^#])|^(\d*)([-+=.)])(?=[\s=-]|$)")  # what Markdown takes for its own
+# what Markdown takes for its own
+MARKUP = re.compile(r"([\\`*_{}\[\]|~$^#])|^(\d*)([-+=.)])(?=[\s=-]|$)")
 NARROW = 1100  # pixels of a screen; the comparison's tables take more
 
 
 def write(
-    out: Path, study: Study, runs: list[Run], rows: list[Row], command: str, more: Sequence[Section] = ()
+    out: Path,
+    study: Study,
+    runs: list[Run],
+    rows: list[Row],
+    command: str,
+    more: Sequence[Section] = (),
 ) -> Path:
-    """Fill `out`; returns the page. Runs that failed or have not run are named, and count in no mean.
+    """Fill `out`; returns the page. Runs that failed or have not run are named, and count in no
+    mean.
 
     Args: more: further sections.
     """
@@ -80,7 +87,10 @@ def write(
         **gallery(study, runs, rows),
     )
     if len(page) > LARGEST:
-        raise DataFailure(f"the page would have {len(page) / 1e6:.0f} MB; name fewer scenes or variants in the study")
+        raise DataFailure(
+            f"the page would have {len(page) / 1e6:.0f} MB; name fewer scenes or "
+            "variants in the study"
+        )
     (out / NAME).write_text(page)
     return out / NAME
 
@@ -94,13 +104,19 @@ def settings_of(study: Study) -> dict[str, float]:
 def note(study: Study, rows: list[Row]) -> str:
     """How to read the table."""
     n_scenes = len({row["scene"] for row in rows})
-    unit = f"Student's over the {n_scenes} scenes" if n_scenes > 1 else "Student's over the seeds of the one scene"
+    unit = (
+        f"Student's over the {n_scenes} scenes"
+        if n_scenes > 1
+        else ("Student's over the seeds of the one scene")
+    )
     first = ""
     if any(hasattr(protocols.ALL[row["protocol"]], "over_scenes") for row in rows):
         first = " mIoU, mAcc and OA are of all scenes of a seed together, as the protocol has it."
     return (
-        f"Mean ± standard deviation over scenes and seeds, on the views of the protocol. Below it: the mean difference "
-        f"(× ratio) from {study.baseline} of runs with the same scene, seed, condition and budget, with its "
+        "Mean ± standard deviation over scenes and seeds, on the views of the protocol. Below "
+        "it: the mean difference "
+        f"(× ratio) from {study.baseline} of runs with the same scene, seed, condition and "
+        "budget, with its "
         f"95 % interval ({unit}); bold where the interval excludes no effect.{first}"
     )  # fmt: skip
 
@@ -119,7 +135,11 @@ def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str
     return [
         ("command", command),
         ("protocol", ", ".join(sorted({row["protocol"] for row in rows}))),
-        ("runs", f"{len(done)} of {len(rows)} done; {len({m.key for m in manifests})} different trainings"),
+        (
+            "runs",
+            f"{len(done)} of {len(rows)} done; {len({m.key for m in manifests})} different "
+            "trainings",
+        ),
         ("device", ", ".join(sorted({m.device for m in manifests}))),
         ("measured on", "; ".join(sorted({measured_on(m) for m in manifests}))),
         ("load of the machine", f"{min(loads):g} to {max(loads):g}" if loads else "not recorded"),
@@ -140,7 +160,9 @@ def markdown(parts: dict[str, Any]) -> str:
     text += [f"- {what}: {inert(value)}" for what, value in parts["facts"]]
     text += ["", f"![error against run time]({PICTURE})", "", inert(parts["note"]), ""]
     shown = [[(inert(a), b, bold) for a, b, bold in row] for _, row in parts["table"]]
-    rows = [[f"{a}<br>{f'**{b}**' if bold else b}" if b else a for a, b, bold in row] for row in shown]
+    rows = [
+        [f"{a}<br>{f'**{b}**' if bold else b}" if b else a for a, b, bold in row] for row in shown
+    ]
     tables = [("", "", [parts["header"], *rows])]
     more = [(f"### {inert(s.heading)}", s.note, s.table) for s in parts["more"]]
     each = [("### Each scene", "", parts["scenes"])] if parts["scenes"][1:] else []

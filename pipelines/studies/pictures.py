@@ -1,4 +1,6 @@
-"""What a study looks like: one view of every scene as each variant renders and labels it, and IoU by class."""
+"""What a study looks like: one view of every scene as each variant renders and labels it, and IoU
+by class.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,12 @@ LONGEST = 480  # side of a picture, pixels
 
 
 def gallery(study: Study, runs: list[Run], rows: list[Row]) -> dict[str, Any]:
-    """The values of the slider and the bars: `pictures`, `modes`, `legend`, `classes`, and `shown` in words.
+    """The values of the slider and the bars: `pictures`, `modes`, `legend`, `classes`, and `shown`
+    in words.
 
-    Choices: of every scene the middle one of its evaluated views, under the first condition, the last budget and the
-      first seed; every run's class IoU under that condition and budget counts. Classes of one name have one colour.
+    Choices: of every scene the middle one of its evaluated views, under the first condition, the
+      last budget and the first seed; every run's class IoU under that condition and budget counts.
+      Classes of one name have one colour.
     """
     condition, budget = next(iter(study.conditions)), list(study.budgets.settings())[-1]
     of_interest = [
@@ -39,14 +43,18 @@ def gallery(study: Study, runs: list[Run], rows: list[Row]) -> dict[str, Any]:
     pixels: Counter[int] = Counter()
     for where, some in scenes.items():
         table = np.array([*(union.index(name) for name in names[where]), -1])
-        evaluations = {variant: Evaluation.read(run.plan.targets["evaluate"]) for variant, run in some.items()}
+        evaluations = {
+            variant: Evaluation.read(run.plan.targets["evaluate"]) for variant, run in some.items()
+        }
         images, counts = _images(evaluations, table, len(union))
         pictures.append({"name": where, "images": images})
         pixels.update(counts)
     variants = [v for v in study.variants if v != study.baseline]
     compared = variants[0] if variants else study.baseline
     there = {key for row in pictures for key, _, _ in row["images"]}
-    colors = {name: "#" + bytes(c).hex() for name, c in zip(union, draw.palette(len(union)), strict=True)}
+    colors = {
+        name: "#" + bytes(c).hex() for name, c in zip(union, draw.palette(len(union)), strict=True)
+    }
     parts = (condition, budget, f"seed {study.seeds[0]}")
     return {
         "pictures": pictures,
@@ -63,7 +71,10 @@ def _names(runs: dict[str, Run]) -> list[str]:
     for run in runs.values():
         evaluation = Evaluation.read(run.plan.targets["evaluate"])
         if "predicted" in evaluation.pictures:
-            inputs = {role: run.plan.targets[stage] for role, stage in (("capture", "ingest"), ("scene", "export"))}
+            inputs = {
+                role: run.plan.targets[stage]
+                for role, stage in (("capture", "ingest"), ("scene", "export"))
+            }
             return label_names(inputs, evaluation.figures)
     return []
 
@@ -71,7 +82,9 @@ def _names(runs: dict[str, Run]) -> list[str]:
 def _images(
     evaluations: dict[str, Evaluation], table: np.ndarray, n: int
 ) -> tuple[list[tuple[str, str, str]], Counter[int]]:
-    """(key, URI, caption) of a scene's pictures, pixels of each of n labels in them. table: its labels -> these."""
+    """(key, URI, caption) of a scene's pictures, pixels of each of n labels in them. table: its
+    labels -> these.
+    """
     first = next(iter(evaluations.values()))
     view = len(first.figures["names"]) // 2
     pixels: Counter[int] = Counter()
@@ -87,27 +100,39 @@ def _images(
     for variant, evaluation in evaluations.items():
         psnr = evaluation.figures["image"]["per_view"]["psnr"][view]
         render = _small(evaluation.pictures["renders"][view])
-        images.append((f"render of {variant}", draw.data_uri(render, photo=True), f"{variant}, {psnr:.1f} dB"))
+        images.append(
+            (f"render of {variant}", draw.data_uri(render, photo=True), f"{variant}, {psnr:.1f} dB")
+        )
         if "predicted" in evaluation.pictures:
             labels(f"labels of {variant}", evaluation.pictures["predicted"], f"{variant}'s labels")
     return images, pixels
 
 
 def _small(image: np.ndarray) -> np.ndarray:
-    """At a whole fraction of its size, so that no side exceeds LONGEST: mean colours, every k-th label."""
+    """At a whole fraction of its size, so that no side exceeds LONGEST: mean colours, every k-th
+    label.
+    """
     step = -(-max(image.shape[:2]) // LONGEST)
-    return np.asarray(Image.fromarray(image).reduce(step)) if image.ndim == 3 else image[::step, ::step]
+    return (
+        np.asarray(Image.fromarray(image).reduce(step))
+        if image.ndim == 3
+        else image[::step, ::step]
+    )
 
 
 def _modes(baseline: str, variants: list[str]) -> list[list[Any]]:
-    """What the slider can compare: photo and truth with the first variant, and the baseline with photo and each."""
+    """What the slider can compare: photo and truth with the first variant, and the baseline with
+    photo and each.
+    """
 
     def of(variant: str, what: bool) -> dict[str, str | None]:
         return side(variant, f"render of {variant}", f"labels of {variant}" if what else None)
 
     first = (variants or [baseline])[0]
     modes = [[f"photo | {first}", side("photo", "truth"), of(first, False)]]
-    modes.append([f"true labels | {first}", side("true labels", "truth", "labels"), of(first, True)])
+    modes.append(
+        [f"true labels | {first}", side("true labels", "truth", "labels"), of(first, True)]
+    )
     if variants:
         modes.append([f"photo | {baseline}", side("photo", "truth"), of(baseline, False)])
     for what, suffix in ((False, ""), (True, ", labels")):
@@ -119,7 +144,9 @@ def _keys(mode: list[Any]) -> set[str]:
     return {s[key] for s in mode[1:] for key in ("base", "over") if s[key]}
 
 
-def _classes(of_interest: list[tuple[Run, Row]], variant: str, baseline: str, colors: dict[str, str]) -> list[tuple]:
+def _classes(
+    of_interest: list[tuple[Run, Row]], variant: str, baseline: str, colors: dict[str, str]
+) -> list[tuple]:
     """(class, colour, the variant's mean IoU over scenes and seeds, the baseline's), best first."""
 
     def means(wanted: str) -> dict[str, float]:

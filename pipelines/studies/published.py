@@ -1,4 +1,6 @@
-"""Tables of a paper: its figures beside those of the runs that stand for them, or why there are none."""
+"""Tables of a paper: its figures beside those of the runs that stand for them, or why there are
+none.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from chebsplat.stages.runtime.config import build
 
 
 def published_sections(study: Study, rows: list[Row]) -> list[Section]:
-    """A section for each of a study's tables: a row for each method of the paper and each variant of ours.
+    """A section for each of a study's tables: a row for each method of the paper and each variant
+    of ours.
 
     A row has the paper's and our value of each figure that the paper gives, the runs that are done,
     and why scenes are lacking. The note says under which protocol both are measured.
@@ -25,13 +28,18 @@ def published_sections(study: Study, rows: list[Row]) -> list[Section]:
         body[0] += ["not run, and why"]
         stands = {row: variant for variant, row in table.variants.items() if row}
         methods = [(row, stands.get(row, "")) for row in table.published]
-        for row, variant in [*methods, *(("", name) for name, of in table.variants.items() if not of)]:
+        for row, variant in [
+            *methods,
+            *(("", name) for name, of in table.variants.items() if not of),
+        ]:
             line = lines.get((condition, variant))
             reasons = lacking(study, condition, variant) if variant else {}
             cells = [row or "-", variant or "-", f"{line.n_done} of {line.n_runs}" if line else "-"]
             for figure in shown:
                 cells += _cells(table.published.get(row, {}), line, figure)
-            listed = {why: "all" if of == table.scenes else ", ".join(of) for why, of in reasons.items()}
+            listed = {
+                why: "all" if of == table.scenes else ", ".join(of) for why, of in reasons.items()
+            }
             body.append([*cells, "; ".join(f"{of}: {why}" for why, of in listed.items()) or "-"])
         done = [row for row in rows if row["condition"] == condition and row["state"] == "done"]
         sections.append(Section(condition, _note(study, condition, done), body))

@@ -1,4 +1,6 @@
-"""What a study found: one row a run, read from the artifacts, and the comparison of its variants."""
+"""What a study found: one row a run, read from the artifacts, and the comparison of its
+variants.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Figure:
-    """A column: its key in a row, its heading, how a value is shown, and whether variants compare by ratio."""
+    """A column: its key in a row, its heading, how a value is shown, and whether variants compare
+    by ratio.
+    """
 
     key: str
     heading: str
@@ -58,15 +62,17 @@ OTHERS = (
     "steps", "clock", "device", "trained_on", "rendered_on", "train_key", "evaluate_key",
 )  # fmt: skip
 IDENTITY = ("condition", "variant", "budget", "scene", "seed", "state")
-POOLED = ("miou", "miou_gain", "macc", "oa")  # what a protocol may work out over all scenes together
+# what a protocol may work out over all scenes together
+POOLED = ("miou", "miou_gain", "macc", "oa")
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
 
 
 def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
-    """One run's figures; None where a thing was not measured. `state` is `done`, or why there are none.
+    """One run's figures; None where a thing was not measured. `state` is `done`, or why there are
+    none.
 
-    Beside the COLUMNS it holds `segmentation`, all that the protocol says of the scene and of its teacher, and
-    `left_out`.
+    Beside the COLUMNS it holds `segmentation`, all that the protocol says of the scene and of its
+    teacher, and `left_out`.
 
     Args: failed: of `Outcome`. Raises: InputError naming a damaged artifact.
     """
@@ -80,7 +86,9 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
             return row | {"state": "not run yet"}
         stage, (code, message, _) = broken[0]
         return row | {"state": f"{stage} failed with exit code {code}: {message}"}
-    evaluation, train, scene = (artifact.read_manifest(targets[stage]) for stage in ("evaluate", "train", "export"))
+    evaluation, train, scene = (
+        artifact.read_manifest(targets[stage]) for stage in ("evaluate", "train", "export")
+    )
     figures = read_figures(targets["evaluate"], evaluation)
     trace = read_trace(targets["train"], train)
     segmentation = figures.get("segmentation") or {}
@@ -129,19 +137,29 @@ def on_one_machine(rows: list[Row]) -> tuple[list[Row], list[str]]:
             (machine, n_here), *others = Counter(row[figure.timed] for row in done).most_common()
             if others:
                 left = "; ".join(f"{n} on {name}" for name, n in others)
-                said.append(f"'{figure.heading}' is of the {n_here} runs on {machine} alone; not compared: {left}")
+                said.append(
+                    f"'{figure.heading}' is of the {n_here} runs on {machine} alone; not "
+                    f"compared: {left}"
+                )
             for row in done:
                 if row[figure.timed] != machine:
                     row[figure.key] = None
     for row in done:
         if row["clock"] and row["train_seconds"] is None:
-            row["state"] = f"its {row['clock']:g} s are of another machine ({row['trained_on']}): not compared"
+            row["state"] = (
+                f"its {row['clock']:g} s are of another machine ({row['trained_on']}): not compared"
+            )
     return kept, said
 
 
 def segmented(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
-    """The columns that figures of a scene and of its teacher fill; a protocol measures some of them."""
-    row: Row = {key: scene.get(key) for key in ("miou", "macc", "oa", "boundary_miou", "rarest_miou", "point_miou")}
+    """The columns that figures of a scene and of its teacher fill; a protocol measures some of
+    them.
+    """
+    row: Row = {
+        key: scene.get(key)
+        for key in ("miou", "macc", "oa", "boundary_miou", "rarest_miou", "point_miou")
+    }
     if row["miou"] is not None and teacher.get("miou") is not None:
         row |= {f"{key}_teacher": teacher.get(key) for key in OF_TEACHER}
         row["miou_gain"] = row["miou"] - teacher["miou"]
@@ -151,17 +169,22 @@ def segmented(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
 def over_scenes(rows: list[Row]) -> list[Row]:
     """One row a seed, its POOLED figures those of all its scenes together as the protocol has it.
 
-    Args: rows: finished ones of one protocol. The rows themselves, where it has no rule for several scenes.
+    Args: rows: finished ones of one protocol. The rows themselves, where it has no rule for several
+      scenes.
     """
     rule = getattr(protocols.ALL[rows[0]["protocol"]], "over_scenes", None) if rows else None
     if rule is None:
         return rows
     pooled = []
     for members in groups([row for row in rows if row["segmentation"]], "seed").values():
-        sides = [[row["segmentation"].get(side) for row in members] for side in ("scene", "teacher")]
+        sides = [
+            [row["segmentation"].get(side) for row in members] for side in ("scene", "teacher")
+        ]
         scene, teacher = ({} if None in of_side else rule(of_side) for of_side in sides)
         name = "+".join(sorted(row["scene"] for row in members))
-        pooled.append(dict.fromkeys(POOLED) | members[0] | {"scene": name} | segmented(scene, teacher))
+        pooled.append(
+            dict.fromkeys(POOLED) | members[0] | {"scene": name} | segmented(scene, teacher)
+        )
     return pooled
 
 
@@ -201,14 +224,17 @@ def groups(rows: list[Row], *names: str) -> dict[tuple, list[Row]]:
 def compare(rows: list[Row], baseline: str) -> list[Line]:
     """Mean ± spread over scenes and seeds, and paired differences against the baseline.
 
-    Choices: a pair needs both runs: what failed on either side drops out of the difference; the line counts its runs.
-      Where a protocol works out a figure over all scenes together, that of a seed is one value, and needs all of them.
+    Choices: a pair needs both runs: what failed on either side drops out of the difference; the
+      line counts its runs. Where a protocol works out a figure over all scenes together, that of a
+      seed is one value, and needs all of them.
     """
     by_line = groups(rows, "condition", "budget", "variant")
     lines = []
     for (condition, budget, variant), members in by_line.items():
         done = [row for row in members if row["state"] == "done"]
-        against = [row for row in by_line.get((condition, budget, baseline), []) if row["state"] == "done"]
+        against = [
+            row for row in by_line.get((condition, budget, baseline), []) if row["state"] == "done"
+        ]
         together = over_scenes(done), over_scenes(against)
         summaries, differences = {}, {}
         for figure in FIGURES:
@@ -221,7 +247,9 @@ def compare(rows: list[Row], baseline: str) -> list[Line]:
                 scenes, own, other = zip(*found, strict=True)
                 difference = paired_difference(own, other, list(scenes), figure.ratio)
                 differences[figure.key] = difference
-        lines.append(Line(condition, budget, variant, len(done), len(members), summaries, differences))
+        lines.append(
+            Line(condition, budget, variant, len(done), len(members), summaries, differences)
+        )
     return lines
 
 
@@ -232,4 +260,8 @@ def pairs(done: list[Row], against: list[Row], key: str) -> list[tuple[str, floa
         return row["scene"], row["seed"]
 
     other = {place(row): row[key] for row in against if row[key] is not None}
-    return [(row["scene"], row[key], other[place(row)]) for row in done if row[key] is not None and place(row) in other]
+    return [
+        (row["scene"], row[key], other[place(row)])
+        for row in done
+        if row[key] is not None and place(row) in other
+    ]

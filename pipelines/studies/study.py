@@ -36,13 +36,17 @@ REFRESH = 300.0  # seconds at least between two writings of a study's page while
 
 
 class Budgets(Section):
-    """What a run may spend. Every budget is a whole training with its own schedule, never a cut of a longer one."""
+    """What a run may spend. Every budget is a whole training with its own schedule, never a cut of
+    a longer one.
+    """
 
     steps: list[Annotated[int, Field(ge=1, le=1_000_000)]] = Field([], max_length=100)
     seconds: list[Annotated[float, Field(ge=0.1, le=604_800)]] = Field([], max_length=100)
 
     def settings(self) -> dict[str, dict[str, Any]]:
-        """train settings by the budget's name; one unnamed budget, the scene's own, where none is given."""
+        """train settings by the budget's name; one unnamed budget, the scene's own, where none is
+        given.
+        """
         settings: dict[str, dict[str, Any]] = {f"{n} steps": {"steps": n} for n in self.steps}
         settings |= {f"{s:g} s": {"seconds": s} for s in self.seconds}
         return settings or {"": {}}
@@ -68,7 +72,9 @@ class Table(Section):
     def folder(self, scene: str) -> str:
         """Where a scene lies, ending in "/"; "" where it does not."""
         root = Path(os.environ.get(self.root) or os.devnull)
-        found = [top / name for top in (root, *sorted(root.glob("*/"))) for name in spellings(scene)]
+        found = [
+            top / name for top in (root, *sorted(root.glob("*/"))) for name in spellings(scene)
+        ]
         return next((f"{path.absolute()}/" for path in found if (path / self.holds).exists()), "")
 
     def lacks(self, scene: str, semantic: bool) -> str:
@@ -77,23 +83,30 @@ class Table(Section):
             return f"{self.root} is not set"
         if not self.folder(scene):
             return f"not in {self.root}" + (f" with {self.holds}/" if self.holds else "")
-        return f"{self.teacher} is not set" if semantic and self.teacher and not os.environ.get(self.teacher) else ""
+        return (
+            f"{self.teacher} is not set"
+            if semantic and self.teacher and not os.environ.get(self.teacher)
+            else ""
+        )
 
     def taught(self, semantic: bool) -> Sections:
         """The settings of the 2D teacher."""
         if not (semantic and self.teacher):
             return {}
-        labels = {"labels": str(PACKAGE / f"teachers/labels/{self.labels}.txt")} if self.labels else {}
+        labels = (
+            {"labels": str(PACKAGE / f"teachers/labels/{self.labels}.txt")} if self.labels else {}
+        )
         return {"teacher": {"kind": "onnx", "model": os.environ[self.teacher]} | labels}
 
 
 class Study(Section):
-    """A file of `configs/studies`, alone or over another that it `extends` (`extended`). `settings`,
-    conditions and variants hold config sections.
+    """A file of `configs/studies`, alone or over another that it `extends` (`extended`).
+    `settings`, conditions and variants hold config sections.
 
-    Conditions are what results are averaged within (a teacher, a noise level); variants are compared, each with
-    `baseline`, under the same condition, budget, scene and seed. A variant may also name an `ablation`. `tables` holds
-    a `Table` for each condition, in the place of `scenes`; what is not there of them does not run.
+    Conditions are what results are averaged within (a teacher, a noise level); variants are
+    compared, each with `baseline`, under the same condition, budget, scene and seed. A variant may
+    also name an `ablation`. `tables` holds a `Table` for each condition, in the place of `scenes`;
+    what is not there of them does not run.
     """
 
     title: str
@@ -106,13 +119,17 @@ class Study(Section):
     conditions: dict[Name, Sections] = Field({"": {}}, max_length=1000)
     variants: dict[Name, dict[str, Any]] = Field(min_length=1, max_length=1000)
     tables: dict[Name, Table] = Field({}, max_length=1000)
-    grows: bool = False  # each scene starts from the lessons of those before it, too, where its variant takes lessons
-    against: str = ""  # section.key whose value is the figure's horizontal axis, instead of run time
+    # each scene starts from the lessons of those before it, too, where its variant takes lessons
+    grows: bool = False
+    # section.key whose value is the figure's horizontal axis, instead of run time
+    against: str = ""
 
     @model_validator(mode="after")
     def _fits_together(self) -> Study:
         if self.baseline not in self.variants:
-            raise ValueError(f"{self.baseline[:60]!r} is none of its variants: {', '.join(self.variants)}")
+            raise ValueError(
+                f"{self.baseline[:60]!r} is none of its variants: {', '.join(self.variants)}"
+            )
         if self.tables.keys() != (set() if self.scenes else self.conditions.keys()):
             raise ValueError("it needs either scenes or tables, one for each of its conditions")
         for name, table in self.tables.items():
@@ -120,7 +137,9 @@ class Study(Section):
                 if of not in self.variants:
                     raise ValueError(f"tables.{name}: {of!r:.60} is none of the study's variants")
                 if row and row not in table.published:
-                    raise ValueError(f"tables.{name}: {row!r:.60} is no row of its published figures")
+                    raise ValueError(
+                        f"tables.{name}: {row!r:.60} is no row of its published figures"
+                    )
         for name, variant in self.variants.items():
             for key, value in variant.items():
                 kind = str if key == "ablation" else dict
@@ -147,7 +166,8 @@ class Run:
     scene: str
     seed: int
     plan: Plan = field(compare=False)
-    before: tuple[Plan, ...] = field(default=(), compare=False)  # of the scenes whose lessons it starts from
+    # of the scenes whose lessons it starts from
+    before: tuple[Plan, ...] = field(default=(), compare=False)
 
     @property
     def steps(self) -> list[Step]:
@@ -155,7 +175,11 @@ class Run:
 
     @property
     def protocol(self) -> str:
-        return next(step.sections["ingest"]["protocol"] for step in self.plan.steps if step.stage == "ingest")
+        return next(
+            step.sections["ingest"]["protocol"]
+            for step in self.plan.steps
+            if step.stage == "ingest"
+        )
 
     @property
     def name(self) -> str:
@@ -199,11 +223,14 @@ def extended(values: dict[str, Any], origin: str) -> dict[str, Any]:
 
 
 def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run]:
-    """Every run, planned; scenes vary slowest and variants fastest, so that a study cut short has compared something.
+    """Every run, planned; scenes vary slowest and variants fastest, so that a study cut short has
+    compared something.
 
-    Args: running, device: of `Planner`. A scene of a table that is not there has no run (`lacking`).
+    Args: running, device: of `Planner`. A scene of a table that is not there has no run
+      (`lacking`).
     Raises: ConfigError, InputError.
-    Choices: all runs of a condition are measured under one protocol, since figures of two must not meet in a mean.
+    Choices: all runs of a condition are measured under one protocol, since figures of two must not
+      meet in a mean.
     """
     planner = Planner(running=running, device=device)
     runs: list[Run] = []
@@ -220,7 +247,11 @@ def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run
                         scene = table.folder(named)
                         values = merged(values, table.taught(is_semantic(values)))
                     earlier = before[seed, condition, budget, variant]
-                    lessons = [one.lesson for one in earlier if one.lesson is not None and one.lesson.lessons]
+                    lessons = [
+                        one.lesson
+                        for one in earlier
+                        if one.lesson is not None and one.lesson.lessons
+                    ]
                     own = {"start": "shipped"} | scene_values(scene)[1].get("knowledge", {})
                     values = merged({"knowledge": own}, merged(values, seeded(scene, values, seed)))
                     place = suffix(f"study-{variant}-seed{seed}-") if study.grows else ""
@@ -233,7 +264,9 @@ def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run
     for condition in study.conditions:
         used = sorted({run.protocol for run in runs if run.condition == condition})
         if len(used) > 1:
-            raise ConfigError(f"scenes measured as {' and as '.join(used)} do not compare; set ingest.protocol")
+            raise ConfigError(
+                f"scenes measured as {' and as '.join(used)} do not compare; set ingest.protocol"
+            )
     return runs
 
 
@@ -260,7 +293,9 @@ def _values(study: Study, condition: str, variant: str) -> Sections:
 
 
 def seeded(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
-    """A seed's settings: training's, and the noise of pseudo labels. A teacher that draws nothing is computed once."""
+    """A seed's settings: training's, and the noise of pseudo labels. A teacher that draws nothing
+    is computed once.
+    """
     kind = merged(scene_values(scene)[1], values).get("teacher", {}).get("kind")
     return {"train": {"seed": seed}} | ({"teacher": {"seed": seed}} if kind == "labels" else {})
 
@@ -280,11 +315,12 @@ def execute(
     on: str = LOCAL,
     refresh: Callable[[], object] = lambda: None,
 ) -> Outcome:
-    """Compute what is outstanding, cores // threads jobs at once; links in `work/study-NAME` keep its artifacts, and
-    `refresh` shows now and then what there is.
+    """Compute what is outstanding, cores // threads jobs at once; links in `work/study-NAME` keep
+    its artifacts, and `refresh` shows now and then what there is.
 
-    A scene and seed is finished, and measured, before the next begins: a study cut short has compared
-    something. A step that fails costs the runs that need it, and no other. On a cluster all are in the queue at once.
+    A scene and seed is finished, and measured, before the next begins: a study cut short has
+    compared something. A step that fails costs the runs that need it, and no other. On a cluster
+    all are in the queue at once.
     """
     outcome = Outcome()
     parts: dict[str, list[Run]] = {}
@@ -311,7 +347,11 @@ def describe(steps: list[Step]) -> str:
     counts: dict[str, int] = {}
     for step in steps:
         counts[step.stage] = counts.get(step.stage, 0) + 1
-    return "to run: " + ", ".join(f"{n} {stage}" for stage, n in counts.items()) if counts else "nothing to run"
+    return (
+        "to run: " + ", ".join(f"{n} {stage}" for stage, n in counts.items())
+        if counts
+        else ("nothing to run")
+    )
 
 
 @contextmanager

@@ -1,4 +1,6 @@
-"""Tables of a study's page: means and differences by variant, each scene, what is missing, what was left out."""
+"""Tables of a study's page: means and differences by variant, each scene, what is missing, what was
+left out.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,14 @@ from chebsplat.evaluation.statistics import Difference, Summary, summarize
 from chebsplat.pipelines.studies.results import FIGURES, Figure, Line, Row, groups, on_one_machine
 from chebsplat.pipelines.studies.study import Study
 
-COSTS = ("n_gaussians", "sh_kept", "bytes_ply", "bytes_ragged", "frames_per_second", "train_seconds")
+COSTS = (
+    "n_gaussians",
+    "sh_kept",
+    "bytes_ply",
+    "bytes_ragged",
+    "frames_per_second",
+    "train_seconds",
+)
 BY_SCENE = ("miou", "miou_gain", "psnr", "n_gaussians", "train_seconds")
 SHOWN = [figure for figure in FIGURES if figure.key in ("miou", "psnr")]
 
@@ -44,7 +53,11 @@ def difference_text(difference: Difference, figure: Figure) -> str:
     def shown(value: float) -> str:
         return f"{value:.2f}" if figure.ratio else number(value, figure)
 
-    interval = "" if math.isnan(difference.low) else f" [{shown(difference.low)}, {shown(difference.high)}]"
+    interval = (
+        ""
+        if math.isnan(difference.low)
+        else (f" [{shown(difference.low)}, {shown(difference.high)}]")
+    )
     sign = "×" if figure.ratio else "+" if difference.mean >= 0 else ""
     return sign + shown(difference.mean) + interval
 
@@ -55,12 +68,20 @@ def shown_figures(lines: list[Line]) -> list[Figure]:
 
 
 def labels(lines: list[Line]) -> list[str]:
-    """What tells lines apart; a study of one condition or of the scenes' own budget does not name it."""
-    return [name for name in ("condition", "budget", "variant") if any(getattr(line, name) for line in lines)]
+    """What tells lines apart; a study of one condition or of the scenes' own budget does not name
+    it.
+    """
+    return [
+        name
+        for name in ("condition", "budget", "variant")
+        if any(getattr(line, name) for line in lines)
+    ]
 
 
 def table_row(line: Line, lines: list[Line]) -> list[tuple[str, str, bool]]:
-    """Cells of one of `lines` as (mean ± spread, paired difference, whether its interval excludes no effect)."""
+    """Cells of one of `lines` as (mean ± spread, paired difference, whether its interval excludes
+    no effect).
+    """
     texts = [*(getattr(line, name) for name in labels(lines)), f"{line.n_done} of {line.n_runs}"]
     cells = [(text, "", False) for text in texts]
     for figure in shown_figures(lines):
@@ -72,16 +93,23 @@ def table_row(line: Line, lines: list[Line]) -> list[tuple[str, str, bool]]:
 
 
 def tables(lines: list[Line], baseline: str) -> list[tuple[list[str], list[tuple[bool, list]]]]:
-    """(header, rows) of the comparison, in two tables that fit a screen: how good it is, and what it costs.
+    """(header, rows) of the comparison, in two tables that fit a screen: how good it is, and what
+    it costs.
 
     A row: whether it is the baseline's, and its cells as of `table_row`.
     """
     fixed, figures = [*labels(lines), "runs"], shown_figures(lines)
-    parts = [[k for k, figure in enumerate(figures) if (figure.key in COSTS) == costs] for costs in (False, True)]
+    parts = [
+        [k for k, figure in enumerate(figures) if (figure.key in COSTS) == costs]
+        for costs in (False, True)
+    ]
     halves = []
     for part in filter(None, parts):
         columns = [*range(len(fixed)), *(len(fixed) + k for k in part)]
-        rows = [(line.variant == baseline, [table_row(line, lines)[k] for k in columns]) for line in lines]
+        rows = [
+            (line.variant == baseline, [table_row(line, lines)[k] for k in columns])
+            for line in lines
+        ]
         halves.append(([*fixed, *(figures[k].heading for k in part)], rows))
     return halves
 
@@ -90,9 +118,15 @@ def scene_table(rows: list[Row]) -> list[list[str]]:
     """Header and rows: each scene apart, mean ± spread over seeds."""
     done = [row for row in rows if row["state"] == "done"]
     figures = [
-        figure for figure in FIGURES if figure.key in BY_SCENE and any(row[figure.key] is not None for row in done)
+        figure
+        for figure in FIGURES
+        if figure.key in BY_SCENE and any(row[figure.key] is not None for row in done)
     ]
-    names = [name for name in ("scene", "condition", "budget", "variant") if any(row[name] for row in done)]
+    names = [
+        name
+        for name in ("scene", "condition", "budget", "variant")
+        if any(row[name] for row in done)
+    ]
     table = [[*names, *(figure.heading for figure in figures)]]
     for where, members in sorted(groups(done, *names).items(), key=lambda item: item[0][0]):
         cells = list(where)
@@ -121,12 +155,17 @@ def left_out(rows: list[Row]) -> list[tuple[str, str, str]]:
     for row in done:
         for entry in row["left_out"].items():
             variants.setdefault(entry, {})[row["variant"]] = None
-    return sorted((*entry, "all" if len(by) == len(every) else ", ".join(by)) for entry, by in variants.items())
+    return sorted(
+        (*entry, "all" if len(by) == len(every) else ", ".join(by))
+        for entry, by in variants.items()
+    )
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Where a curve gets to a value: at `x`, before (`≤`) its first point, or not (`>`) up to its last."""
+    """Where a curve gets to a value: at `x`, before (`≤`) its first point, or not (`>`) up to its
+    last.
+    """
 
     x: float
     bound: str = ""
@@ -166,9 +205,14 @@ def sections(study: Study, rows: list[Row]) -> list[Section]:
         return []
     header = [*(["condition"] if len(table[0]) > 2 + 3 * len(SHOWN) else []), "scene", "variant"]
     for figure in SHOWN:
-        header += [f"{figure.heading} of {study.baseline} at the end", "its seconds", "seconds to reach it"]
+        header += [
+            f"{figure.heading} of {study.baseline} at the end",
+            "its seconds",
+            "seconds to reach it",
+        ]
     note = (
-        f"Where the line through the budgets' means first reaches what {study.baseline} ends with ({budgets[-1]}), in "
+        f"Where the line through the budgets' means first reaches what {study.baseline} ends with "
+        f"({budgets[-1]}), in "
         "seconds of training and as a share of its seconds; '≤': with the smallest budget already. "
         "Means over seeds."
     )
@@ -176,7 +220,9 @@ def sections(study: Study, rows: list[Row]) -> list[Section]:
 
 
 def reached(end: list[Row], budgets: list[list[Row]], figure: Figure) -> list[str]:
-    """A figure of the baseline's last runs, their seconds, and the seconds and share in which others get there."""
+    """A figure of the baseline's last runs, their seconds, and the seconds and share in which
+    others get there.
+    """
     if any(row[figure.key] is None for some in (end, *budgets) for row in some):
         return ["-", "-", "-"]
 
@@ -184,5 +230,11 @@ def reached(end: list[Row], budgets: list[list[Row]], figure: Figure) -> list[st
         return float(np.mean([row[key] for row in some]))
 
     target, whole = mean(end, figure.key), mean(end, "train_seconds")
-    found = reach([(mean(some, "train_seconds"), mean(some, figure.key)) for some in budgets], target)
-    return [number(target, figure), f"{whole:.0f}", f"{found.bound}{found.x:.0f} ({found.share(whole)})"]
+    found = reach(
+        [(mean(some, "train_seconds"), mean(some, figure.key)) for some in budgets], target
+    )
+    return [
+        number(target, figure),
+        f"{whole:.0f}",
+        f"{found.bound}{found.x:.0f} ({found.share(whole)})",
+    ]

@@ -1,4 +1,6 @@
-"""Finished scenes by what a user calls them: a name, the folder of photos, a folder of links in work, an artifact."""
+"""Finished scenes by what a user calls them: a name, the folder of photos, a folder of links in
+work, an artifact.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ def is_artifact(path: Path) -> bool:
 
 
 def links(folder: Path) -> dict[str, Path]:
-    """Artifacts that a folder names, stages in their order; whatever else lies there is none of ours."""
+    """Artifacts that a folder names, stages in their order; whatever else lies there is none of
+    ours.
+    """
     try:
         stages = [entry.name for entry in os.scandir(folder) if is_artifact(Path(entry.path))]
     except OSError:
@@ -32,16 +36,23 @@ def links(folder: Path) -> dict[str, Path]:
 
 
 def titles() -> list[str]:
-    """Names of the folders of links in work: of scenes, with their settings, of sequences and studies."""
+    """Names of the folders of links in work: of scenes, with their settings, of sequences and
+    studies.
+    """
     base = store.work()
     there = sorted(os.listdir(base)) if os.path.isdir(base) else []
-    return [name for name in there if not name.startswith(".") and name != "store" and links(base / name)]
+    return [
+        name
+        for name in there
+        if not name.startswith(".") and name != "store" and links(base / name)
+    ]
 
 
 def scene_folder(scene: str) -> Path:
     """The folder of a finished scene's links.
 
-    Raises: ConfigError with the nearest names, or if several are meant; InputError for a path that leads to none.
+    Raises: ConfigError with the nearest names, or if several are meant; InputError for a path that
+      leads to none.
     """
     path = Path(os.path.expanduser(scene))
     if "/" not in scene and links(store.work() / scene):
@@ -57,7 +68,9 @@ def scene_folder(scene: str) -> Path:
     if len(runs) == 1 or name in runs:
         return store.work() / (name if name in runs else runs[0])
     if runs:
-        raise ConfigError(f"{shown(scene)} was run with different settings: name one of {', '.join(runs)}")
+        raise ConfigError(
+            f"{shown(scene)} was run with different settings: name one of {', '.join(runs)}"
+        )
     raise unknown(scene)
 
 
@@ -67,31 +80,45 @@ def holder(artifact: Path) -> Path | None:
         return artifact.parent
     real = artifact.resolve()
     for title in titles():
-        if any(link.resolve() == real for stage, link in links(store.work() / title).items() if stage in STAGES):
+        if any(
+            link.resolve() == real
+            for stage, link in links(store.work() / title).items()
+            if stage in STAGES
+        ):
             return store.work() / title
     return None
 
 
 def unknown(scene: str) -> ConfigError | InputError:
     """The error for a scene that is not there, with the nearest names."""
-    where, run = f"no finished scene in {store.work()}", f"run it first: make scene={quote(shown(scene))}"
+    where, run = (
+        f"no finished scene in {store.work()}",
+        (f"run it first: make scene={quote(shown(scene))}"),
+    )
     if is_splat(path := os.path.expanduser(scene)) and os.path.exists(path):
         return InputError(
-            f"{shown(scene)} is a splat and {where}; make one of it: chebsplat lift {quote(shown(scene))} --out ..."
+            f"{shown(scene)} is a splat and {where}; make one of it: chebsplat lift "
+            f"{quote(shown(scene))} --out ..."
         )
     if is_source(os.path.expanduser(scene)):
         return InputError(f"{shown(scene)} is {where}, nor the folder of one; {run}")
     if "/" in scene:
-        return InputError(f"{shown(scene)} is missing: neither a scene, its folder nor an artifact; correct the path")
+        return InputError(
+            f"{shown(scene)} is missing: neither a scene, its folder nor an "
+            "artifact; correct the path"
+        )
     known = titles()
     near = suggest(scene, known) or known[:8]
     if near and scene not in names("scenes"):
-        return ConfigError(f"{shown(scene)} is {where}, and no folder of one; there is {', '.join(near)}")
+        return ConfigError(
+            f"{shown(scene)} is {where}, and no folder of one; there is {', '.join(near)}"
+        )
     return ConfigError(f"{shown(scene)} is {where}, and no folder of one; {run}")
 
 
 def artifact_of(scene: str, stage: str) -> Path:
-    """A scene's artifact of a stage; an artifact is taken as it is, and its reader says if it is of another kind.
+    """A scene's artifact of a stage; an artifact is taken as it is, and its reader says if it is of
+    another kind.
 
     Raises: as `scene_folder`; ConfigError if the scene has no such artifact.
     """
@@ -105,7 +132,9 @@ def artifact_of(scene: str, stage: str) -> Path:
 
 
 def teacher_of(scene: str) -> Path | None:
-    """A scene's `features` artifact; None without semantics, and for an artifact of no scene in `work`."""
+    """A scene's `features` artifact; None without semantics, and for an artifact of no scene in
+    `work`.
+    """
     with suppress(ConfigError, InputError):
         path = scene_folder(scene) / "teacher"
         return path if is_artifact(path) else None

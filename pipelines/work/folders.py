@@ -37,7 +37,9 @@ def name_of(folder: Path) -> str:
     ours = short.startswith("study-")  # so begin links of studies
     name = f"folder-{short}-{digits}" if ours else f"{short}-{digits}"
     if (other := owner(name)) not in (None, str(folder)):
-        raise ConfigError(f"{folder}: {name} stands for {other}; rename one, or remove {record(name)}")
+        raise ConfigError(
+            f"{folder}: {name} stands for {other}; rename one, or remove {record(name)}"
+        )
     return name
 
 

@@ -1,8 +1,8 @@
 """Sets of lessons that scenes have taught, and which of them a scene is pinned to.
 
-A set is a folder of the work folder, `.heads/NAME`, with a copy of every lesson under its key, and beside it what it is
-of. A lesson is added by a rename, so that any number of processes add at once, in any order, to the same set; none is
-ever changed.
+A set is a folder of the work folder, `.heads/NAME`, with a copy of every lesson under its key, and
+beside it what it is of. A lesson is added by a rename, so that any number of processes add at once,
+in any order, to the same set; none is ever changed.
 """
 
 from __future__ import annotations
@@ -32,15 +32,19 @@ def now() -> str:
 
 
 def folder(name: str) -> Path:
-    """Where the set of this name lies, or will. Raises ConfigError on a name that leads elsewhere."""
+    """Where the set of this name lies, or will. Raises ConfigError on a name that leads
+    elsewhere.
+    """
     if not store.is_name(name):
-        raise ConfigError(f"{name!r} cannot name a set of lessons: no / in it, and no . at its beginning")
+        raise ConfigError(
+            f"{name!r} cannot name a set of lessons: no / in it, and no . at its beginning"
+        )
     return store.work() / ".heads" / name
 
 
 def members(name: str) -> dict[str, dict[str, Any]]:
-    """By key what each lesson of a set is of: the photos' identity (`capture`), the encoder's key (`start`), the scene,
-    and when it was added. Raises InputError naming a record that is damaged.
+    """By key what each lesson of a set is of: the photos' identity (`capture`), the encoder's key
+    (`start`), the scene, and when it was added. Raises InputError naming a record that is damaged.
     """
     found = {}
     for path in sorted(folder(name).glob("[!.]*.json")):
@@ -54,7 +58,9 @@ def members(name: str) -> dict[str, dict[str, Any]]:
 
 
 def _record(place: Path) -> dict[str, Any]:
-    """What lies beside a lesson; empty where nothing does. Raises InputError where that is damaged."""
+    """What lies beside a lesson; empty where nothing does. Raises InputError where that is
+    damaged.
+    """
     path = place.with_suffix(".json")
     record = parse_json(path, REMEDY) if path.is_file() else {}
     if not isinstance(record, dict):
@@ -65,7 +71,8 @@ def _record(place: Path) -> dict[str, Any]:
 def add(name: str, made: Path, capture: str, start: str, scene: str) -> None:
     """Put a finished lesson into a set, unless it teaches nothing, or is there.
 
-    Args: made: the artifact, whose folder bears its key; capture: identity of the photos; start: key of the encoder.
+    Args: made: the artifact, whose folder bears its key; capture: identity of the photos; start:
+      key of the encoder.
     """
     place = folder(name) / made.name
     if store.is_fresh(place) or "none" in lesson.read_notes(made) or FORGOTTEN in _record(place):
@@ -77,31 +84,44 @@ def add(name: str, made: Path, capture: str, start: str, scene: str) -> None:
 
 
 def forget(name: str, key: str) -> None:
-    """Take a lesson out of a set. Raises ConfigError with the nearest keys where it is not there."""
+    """Take a lesson out of a set. Raises ConfigError with the nearest keys where it is not
+    there.
+    """
     held = members(name)
     if key not in held:
         near = suggest(key, held, 1)
-        raise ConfigError(f"{name} has no lesson {key}" + (f"; did you mean {near[0]}?" if near else ""))
+        raise ConfigError(
+            f"{name} has no lesson {key}" + (f"; did you mean {near[0]}?" if near else "")
+        )
     place = folder(name) / key
-    atomic_write(place.with_suffix(".json"), json.dumps({FORGOTTEN: True}))  # no run of the scene adds it again
+    # no run of the scene adds it again
+    atomic_write(place.with_suffix(".json"), json.dumps({FORGOTTEN: True}))
     (place / "artifact.json").unlink()
     shutil.rmtree(place)
 
 
 def usable(name: str, start: str, capture: str, scene: str) -> list[str]:
-    """Keys of the lessons of a set for an encoder, of other scenes and photos; of the same photos the latest."""
+    """Keys of the lessons of a set for an encoder, of other scenes and photos; of the same photos
+    the latest.
+    """
     latest: dict[str, tuple[str, str]] = {}
     for key, record in members(name).items():
         if record["start"] == start and record["capture"] != capture and record["scene"] != scene:
-            latest[record["capture"]] = max(latest.get(record["capture"], ("", "")), (record["date"], key))
+            latest[record["capture"]] = max(
+                latest.get(record["capture"], ("", "")), (record["date"], key)
+            )
     return sorted(key for _, key in latest.values())
 
 
-def pinned(title: str, name: str, start: str, capture: str, scene: str, *, running: bool, newer: bool) -> list[str]:
-    """Keys of the lessons that a scene starts from: those that `work/TITLE/pin.json` names for this set, encoder and
-    photos; what stands now where it names none, or newer ones are asked for. A run writes them down.
+def pinned(
+    title: str, name: str, start: str, capture: str, scene: str, *, running: bool, newer: bool
+) -> list[str]:
+    """Keys of the lessons that a scene starts from: those that `work/TITLE/pin.json` names for this
+    set, encoder and photos; what stands now where it names none, or newer ones are asked for. A run
+    writes them down.
 
-    Args: capture: identity of the photos; scene: whose lessons are left out, too, as those of the photos are.
+    Args: capture: identity of the photos; scene: whose lessons are left out, too, as those of the
+      photos are.
     Raises: InputError naming a pin that is damaged.
     """
     path, pins = store.work() / title / PIN, dict[str, list[str]]()
@@ -129,5 +149,8 @@ def taken(title: str, name: str, key: str, running: bool) -> Path:
     if store.is_fresh(path):
         return path
     if not store.is_fresh(folder(name) / key):
-        raise ConfigError(f"{title} is pinned to the lesson {key}, which {name} has no more; add newer=1 (--newer)")
+        raise ConfigError(
+            f"{title} is pinned to the lesson {key}, which {name} has no more; add "
+            "newer=1 (--newer)"
+        )
     return store.taken_in(folder(name) / key, "learn", lesson.SCHEMA, running)

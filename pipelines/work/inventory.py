@@ -23,13 +23,17 @@ COLUMNS = ("scene", "source", "done", "MB", "alone", "when", "PSNR", "mIoU")
 
 def scenes() -> list[tuple[str, ...]]:
     """A row of COLUMNS for each folder of links in work, of a scene or a study, as far as it can be
-    read: MB of what it names and of all that this was made of, and of what nothing else was made of;
+    read: MB of what it names and of all that this was made of, and of what nothing else was made
+      of;
     when the newest of what it names was finished. What is damaged counts nothing.
     """
     store_paths = store.work().glob("store/*/*")
     held = {path.name: _manifest(path) for path in store_paths if not path.name.startswith(".")}
     reached = {title: _made_of(title, held) for title in titles()}
-    sizes, times = {key: _size(manifest) for key, manifest in held.items()}, Counter(chain(*reached.values()))
+    sizes, times = (
+        {key: _size(manifest) for key, manifest in held.items()},
+        Counter(chain(*reached.values())),
+    )
     rows: list[tuple[str, ...]] = []
     for title, keys in reached.items():
         named = links(store.work() / title)
@@ -37,11 +41,19 @@ def scenes() -> list[tuple[str, ...]]:
         when = time.strftime("%Y-%m-%d %H:%M", time.localtime(newest))
         stages = [stage for stage in named if stage in STAGES]
         done = "all" if "report" in named else " ".join(stages) or f"{len(named)} artifacts"
-        source = _source(title, _manifest(named["ingest"]) if "ingest" in named else None) if stages else ""
-        psnr, miou, _ = summary.quality(summary.figures(named["evaluate"]) if "evaluate" in named else None)
+        source = (
+            _source(title, _manifest(named["ingest"]) if "ingest" in named else None)
+            if stages
+            else ""
+        )
+        psnr, miou, _ = summary.quality(
+            summary.figures(named["evaluate"]) if "evaluate" in named else None
+        )
         size = sum(sizes[key] for key in keys)
         alone = sum(sizes[key] for key in keys if times[key] == 1)
-        rows.append((title, source, done, f"{size / 1e6:.1f}", f"{alone / 1e6:.1f}", when, psnr, miou))
+        rows.append(
+            (title, source, done, f"{size / 1e6:.1f}", f"{alone / 1e6:.1f}", when, psnr, miou)
+        )
     return rows
 
 
@@ -57,7 +69,9 @@ def _size(manifest: Manifest | None) -> int:
 
 
 def _source(title: str, ingest: Manifest | None) -> str:
-    """Where a scene comes from: the folder that its name stands for, or what its capture was made of."""
+    """Where a scene comes from: the folder that its name stands for, or what its capture was made
+    of.
+    """
     try:
         if folder := folders.owner(title.partition("@")[0]):
             return folder
@@ -68,8 +82,8 @@ def _source(title: str, ingest: Manifest | None) -> str:
 
 
 def in_work(scene: str) -> Path:
-    """A scene's folder of links. Raises InputError if it lies elsewhere: nothing is removed there; ConfigError if an
-    artifact is named.
+    """A scene's folder of links. Raises InputError if it lies elsewhere: nothing is removed there;
+    ConfigError if an artifact is named.
     """
     folder = scene_folder(scene)
     if is_artifact(Path(os.path.expanduser(scene))):
@@ -88,8 +102,16 @@ def only_of(chosen: list[Path]) -> list[tuple[Path, int]]:
 def untouched(age: float) -> list[Path]:
     """Folders of scenes and studies whose artifacts are all older than so many seconds."""
     found = {title: links(store.work() / title) for title in titles()}
-    ours = {title: paths for title, paths in found.items() if set(paths) & set(STAGES) or title.startswith("study-")}
-    return [store.work() / title for title, paths in ours.items() if min(map(store.age, paths.values())) >= age]
+    ours = {
+        title: paths
+        for title, paths in found.items()
+        if set(paths) & set(STAGES) or title.startswith("study-")
+    }
+    return [
+        store.work() / title
+        for title, paths in ours.items()
+        if min(map(store.age, paths.values())) >= age
+    ]
 
 
 def _made_of(title: str, manifests: dict[str, Manifest | None]) -> set[str]:

@@ -31,12 +31,15 @@ def read_toml(kind: str, name: str) -> dict[str, Any]:
     """A config of ours. Raises ConfigError with the nearest names."""
     if name not in names(kind):
         near = suggest(name, names(kind)) or names(kind)
-        raise ConfigError(f"no {ONE[kind]} is called {shown(name)}; did you mean {', '.join(near)}?")
+        raise ConfigError(
+            f"no {ONE[kind]} is called {shown(name)}; did you mean {', '.join(near)}?"
+        )
     return tomllib.loads((CONFIGS / kind / f"{name}.toml").read_text())
 
 
 def read_named(kind: str, name: str) -> dict[str, Any]:
-    """A config of ours by name, or a file of the user's that ends in .toml, after which links are called.
+    """A config of ours by name, or a file of the user's that ends in .toml, after which links are
+    called.
 
     Raises ConfigError naming the file, or the nearest names.
     """
@@ -58,11 +61,17 @@ def expanded(text: str) -> str:
 
 
 def folder_of(scene: str) -> Path | None:
-    """The folder or video that `scene` is, absolute; None of a scene of ours. Raises InputError if there is none."""
+    """The folder or video that `scene` is, absolute; None of a scene of ours. Raises InputError if
+    there is none.
+    """
     if not scene:
         raise ConfigError("scene= is empty; name a scene or a folder")
     folder = Path(os.path.expanduser(scene))
-    if "/" not in scene and scene not in (".", "..") and (scene in names("scenes") or not is_source(folder)):
+    if (
+        "/" not in scene
+        and scene not in (".", "..")
+        and (scene in names("scenes") or not is_source(folder))
+    ):
         return None
     if not is_source(folder):
         raise InputError(f"{shown(scene)} is not a folder; correct scene=")
@@ -75,14 +84,19 @@ def is_source(path: str | Path) -> bool:
 
 
 def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
-    """(name, config values) of a named scene, or of a folder of photos, a COLMAP model, a video and so on.
+    """(name, config values) of a named scene, or of a folder of photos, a COLMAP model, a video and
+    so on.
 
-    The name is part of what is computed, and the same wherever a folder lies; its links' may be longer (`folders`).
+    The name is part of what is computed, and the same wherever a folder lies; its links' may be
+    longer (`folders`).
     """
     folder = folder_of(scene)
     if folder is not None:
         name = folder_name(folder)
-        return name, {"scene": {"name": name}, "source": {"kind": detect(folder), "path": str(folder)}}
+        return name, {
+            "scene": {"name": name},
+            "source": {"kind": detect(folder), "path": str(folder)},
+        }
     values = read_toml("scenes", scene)
     values.setdefault("scene", {})["name"] = scene
     return scene, values
@@ -91,13 +105,20 @@ def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
 def folder_name(folder: Path) -> str:
     """A source's name: the last part of its path, and those above it up to one with a letter."""
     parts = (folder.with_suffix("") if is_video(folder.name) else folder).parts[1:]
-    words = next((k for k in range(1, len(parts)) if re.search(r"[a-zA-Z]", parts[-k])), 1)  # "dense/0" is no "0"
+    # "dense/0" is no "0"
+    words = next((k for k in range(1, len(parts)) if re.search(r"[a-zA-Z]", parts[-k])), 1)
     return re.sub(r"[^\w.-]+", "-", "-".join(parts[-words:])).lstrip(".") or "scene"
 
 
 def data_of(scene: str) -> tuple[str, Path] | None:
-    """(environment variable, folder) of the data that a scene of ours needs and that is no part of chebsplat."""
-    path = read_toml("scenes", scene).get("source", {}).get("path", "") if scene in names("scenes") else ""
+    """(environment variable, folder) of the data that a scene of ours needs and that is no part of
+    chebsplat.
+    """
+    path = (
+        read_toml("scenes", scene).get("source", {}).get("path", "")
+        if scene in names("scenes")
+        else ""
+    )
     if found := VARIABLE.match(path):
         return found[1], Path(os.path.realpath(os.path.expanduser(expanded(path))))
     return None

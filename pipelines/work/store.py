@@ -1,4 +1,6 @@
-"""The work folder: artifacts by key, links by scene, remembered hashes, and the collection of what nothing names."""
+"""The work folder: artifacts by key, links by scene, remembered hashes, and the collection of what
+nothing names.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ def make_work() -> None:
     try:
         work().mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError, FileNotFoundError):
-        raise ConfigError(f"{work()} is no folder and cannot become one; set CHEBSPLAT_WORK to a folder") from None
+        raise ConfigError(
+            f"{work()} is no folder and cannot become one; set CHEBSPLAT_WORK to a folder"
+        ) from None
 
 
 def lease(base: Path, name: str) -> Path:
@@ -55,7 +59,9 @@ def say(text: str) -> None:
 
 
 def is_fresh(path: Path) -> bool:
-    """Finished, every member there in its size. Other damage is found by the stage that reads it, or by `verify`."""
+    """Finished, every member there in its size. Other damage is found by the stage that reads it,
+    or by `verify`.
+    """
     return artifact.is_whole(path)
 
 
@@ -83,17 +89,22 @@ class Memo:
             try:
                 atomic_write(self.path, text)
             except OSError as error:
-                say(f"{self.path} cannot be written ({error.strerror}): what it would spare is done again next time")
+                say(
+                    f"{self.path} cannot be written ({error.strerror}): what it would spare is "
+                    "done again next time"
+                )
 
 
 def link(scene: str, targets: dict[str, Path]) -> Path:
-    """Point `work/<scene>/<stage>` at the finished of `targets`. Stages that the scene leaves out lose their link;
-    those that are still to run keep it, and with it the artifact that it names.
+    """Point `work/<scene>/<stage>` at the finished of `targets`. Stages that the scene leaves out
+    lose their link; those that are still to run keep it, and with it the artifact that it names.
 
     Raises: ConfigError on a name that would lead out of the work folder.
     """
     if not is_name(scene):
-        raise ConfigError(f"{scene!r} cannot name a folder of links: no / in it, and no . at its beginning")
+        raise ConfigError(
+            f"{scene!r} cannot name a folder of links: no / in it, and no . at its beginning"
+        )
     folder = work() / scene
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.iterdir():
@@ -114,8 +125,9 @@ def link(scene: str, targets: dict[str, Path]) -> Path:
 
 
 def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
-    """Artifacts that no link and no running plan reaches, neither directly nor as an input, and leftovers of runs that
-    failed or were killed; with bytes. Raises InputError if a manifest is damaged.
+    """Artifacts that no link and no running plan reaches, neither directly nor as an input, and
+    leftovers of runs that failed or were killed; with bytes. Raises InputError if a manifest is
+    damaged.
 
     Args: without: folders whose links count for nothing.
     """
@@ -134,13 +146,19 @@ def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
         named.add(path)
         keys = [entry["key"] for entry in parse_manifest(path).inputs.values()]
         waiting += [by_key[key] for key in keys if key in by_key]
-    leftovers = [p for p in sorted(base.glob("store/*/*")) if _real(p) not in named and not _in_use(p, running)]
+    leftovers = [
+        p
+        for p in sorted(base.glob("store/*/*"))
+        if _real(p) not in named and not _in_use(p, running)
+    ]
     leftovers += [p for p in sorted(base.glob(".plans/*")) if not is_under_way(p)]
     return [(p, sum(f.stat().st_size for f in p.rglob("*") if f.is_file())) for p in leftovers]
 
 
 def age(path: Path) -> float:
-    """Seconds since an artifact was finished, or a leftover was last changed, by the clock of the file system."""
+    """Seconds since an artifact was finished, or a leftover was last changed, by the clock of the
+    file system.
+    """
     done = path / "artifact.json"
     changed = (done if done.is_file() else path).lstat().st_mtime
     with tempfile.TemporaryFile(dir=work()) as clock:
@@ -159,7 +177,9 @@ def sweep() -> None:
 
 
 def _real(path: Path) -> Path:
-    """Where a path leads; unlike `Path.resolve`, it takes links that lead in a circle for what they are."""
+    """Where a path leads; unlike `Path.resolve`, it takes links that lead in a circle for what they
+    are.
+    """
     return Path(os.path.realpath(path))
 
 
@@ -175,7 +195,9 @@ def _running(base: Path) -> set[Path]:
             continue
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             advice = f"remove {plan.parent} if no run is under way"
-            raise InputError(f"{plan} is damaged: what that run needs is not known; {advice}") from None
+            raise InputError(
+                f"{plan} is damaged: what that run needs is not known; {advice}"
+            ) from None
     return found
 
 
@@ -185,7 +207,9 @@ def is_under_way(plans: Path) -> bool:
 
 
 def holder(path: Path) -> str | None:
-    """The machine of whoever holds a lease; None: nobody, or one elsewhere, silent by the file system's clock."""
+    """The machine of whoever holds a lease; None: nobody, or one elsewhere, silent by the file
+    system's clock.
+    """
     machine = leases.holder(path)
     with suppress(FileNotFoundError):  # it has just been let go
         if machine == socket.gethostname() or (machine and age(path) < leases.EXPIRES):
@@ -197,11 +221,15 @@ def _in_use(path: Path, running: set[Path]) -> bool:
     """A hidden folder of a running process or of a run under way, or younger than an hour."""
     if not path.name.startswith("."):
         return False
-    if path.name.startswith(".tmp-"):  # .tmp-<key>-<process>, of this machine or of one that a run has sent its jobs to
+    # .tmp-<key>-<process>, of this machine or of one that a run has sent its jobs to
+    if path.name.startswith(".tmp-"):
         return _owner_lives(path) or path.with_name(path.name.split("-")[1]) in running
     if not path.name.startswith(".part-"):
         return False
-    return path.with_name(path.name[len(".part-") :]) in running or time.time() - path.lstat().st_mtime < 3600
+    return (
+        path.with_name(path.name[len(".part-") :]) in running
+        or time.time() - path.lstat().st_mtime < 3600
+    )
 
 
 def remove_half(path: Path) -> None:
@@ -242,7 +270,8 @@ def remove(path: Path) -> None:
 
 
 def taken_in(folder: Path, stage: str, schema: str, running: bool) -> Path:
-    """The place in the store of a stage's artifact that lies elsewhere; to run, it is copied there, and verified.
+    """The place in the store of a stage's artifact that lies elsewhere; to run, it is copied there,
+    and verified.
 
     Raises: InputError on a damaged artifact, or one of another schema.
     """

@@ -23,7 +23,9 @@ LINES = 5  # of a failed step's log
 
 
 def figures(evaluation: Path) -> Any:
-    """What an evaluation measured; None where there is none, or it is damaged (`chebsplat verify` says how)."""
+    """What an evaluation measured; None where there is none, or it is damaged (`chebsplat verify`
+    says how).
+    """
     try:
         return read_document(evaluation, artifact.read_manifest(evaluation), "figures.json")
     except InputError:
@@ -50,13 +52,19 @@ def quality(figures: Any) -> tuple[str, str, str]:
 
 
 def table(evaluation: Path) -> list[tuple[str, str, str]]:
-    """(what, value, beside it) of a scene that was evaluated; what was not measured is not there."""
-    from chebsplat.formats.evaluation import rests  # with zarr, which a list of scenes does not wait for
+    """(what, value, beside it) of a scene that was evaluated; what was not measured is not
+    there.
+    """
+    # with zarr, which a list of scenes does not wait for
+    from chebsplat.formats.evaluation import rests
 
     measured = figures(evaluation)
     where = f", measured on {measured_on(artifact.read_manifest(evaluation))}" if measured else ""
     psnr, miou, teacher = quality(measured)
-    size = {name: text("{:.1f} MB", scaled(number(measured, "bytes", name))) for name in ("ply", "split", "ragged")}
+    size = {
+        name: text("{:.1f} MB", scaled(number(measured, "bytes", name)))
+        for name in ("ply", "split", "ragged")
+    }
     others = ", ".join(f"{name} {shown}" for name, shown in size.items() if shown and name != "ply")
     segmentation = (measured or {}).get("segmentation") or {}
     beside = [rests(segmentation), f"its 2D teacher {teacher}" if teacher else ""]
@@ -64,31 +72,45 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
         miou, beside = "none", [measured["left_out"].get("mIoU", "")]
     rows = [
         ("test PSNR", psnr, text("SSIM {:.3f}", number(measured, "image", "ssim"))),
-        ("as taken", text("{:.1f} dB", number(measured, "image", "as_taken", "psnr")), as_taken(measured)),
+        (
+            "as taken",
+            text("{:.1f} dB", number(measured, "image", "as_taken", "psnr")),
+            as_taken(measured),
+        ),
         ("mIoU", miou, "; ".join(filter(None, beside))),
         *((what, str(len(names)), few(names)) for what, names in strangers(segmentation)),
         ("Gaussians", text("{:,}", number(measured, "n_gaussians")), ""),
         ("PLY", size["ply"], others),
-        ("frames/s", text("{:.0f}", number(measured, "frames_per_second", "color")), f"colour alone{where}"),
+        (
+            "frames/s",
+            text("{:.0f}", number(measured, "frames_per_second", "color")),
+            f"colour alone{where}",
+        ),
     ]
     return [row for row in rows if row[1]]
 
 
 def as_taken(figures: Any) -> str:
-    """SSIM and size of test photos as they were taken; empty where these are what was trained on."""
+    """SSIM and size of test photos as they were taken; empty where these are what was trained
+    on.
+    """
     found = (figures or {}).get("image", {}).get("as_taken")
     return "SSIM {:.3f}, {}×{} pixels".format(found["ssim"], *found["size"]) if found else ""
 
 
 def strangers(segmentation: Any) -> list[tuple[str, list[str]]]:
-    """Classes of the truth, and labels of the scene, that the other has no name for; nothing where there are none."""
+    """Classes of the truth, and labels of the scene, that the other has no name for; nothing where
+    there are none.
+    """
     words = {"truth": "true classes without a label", "scene": "labels that are no class"}
     found = segmentation.get("unmatched", {})
     return [(what, found[side]) for side, what in words.items() if side in found]
 
 
 def doubts(made: dict[str, Path]) -> list[str]:
-    """What is doubtful about the poses of a scene, or about its teacher, in sentences. made: artifacts by stage."""
+    """What is doubtful about the poses of a scene, or about its teacher, in sentences. made:
+    artifacts by stage.
+    """
     said: list[str] = []
     for stage in {"pose", "agree"} & made.keys():
         facts = artifact.read_manifest(made[stage]).facts
@@ -112,7 +134,10 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     if not rows:
         return []
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
 
 
 def show_rows(rows: Sequence[Sequence[str]]) -> None:

@@ -1,4 +1,6 @@
-"""Image figures of rendered views: PSNR, SSIM, LPIPS where its weights are given, and frames per second."""
+"""Image figures of rendered views: PSNR, SSIM, LPIPS where its weights are given, and frames per
+second.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +30,17 @@ LEAST_SIDE = 16  # pixels, of LPIPS
 
 
 def image_figures(
-    renders: np.ndarray, truth: np.ndarray, masks: list[np.ndarray] | None, lpips: Lpips | None = None
+    renders: np.ndarray,
+    truth: np.ndarray,
+    masks: list[np.ndarray] | None,
+    lpips: Lpips | None = None,
 ) -> dict[str, Any]:
-    """PSNR, SSIM and LPIPS of 8-bit images, by view and in the mean; `lpips` is None where not measured.
+    """PSNR, SSIM and LPIPS of 8-bit images, by view and in the mean; `lpips` is None where not
+    measured.
 
-    Choices: masked pixels do not count; for SSIM and LPIPS they take the true colour. `psnr_fit` is the PSNR after an
-      affine fit of a render's colours to its photo: what exposure and white balance of the test photos do not spoil.
+    Choices: masked pixels do not count; for SSIM and LPIPS they take the true colour. `psnr_fit` is
+      the PSNR after an affine fit of a render's colours to its photo: what exposure and white
+      balance of the test photos do not spoil.
     """
     names = ("psnr", "psnr_fit", "ssim", *(["lpips"] if lpips else []))
     per_view: dict[str, list[float]] = {name: [] for name in names}
@@ -50,13 +57,16 @@ def image_figures(
     return {"lpips": None} | means | {"per_view": per_view}
 
 
-def figures_as_taken(capture: Capture, renderer: SceneRenderer, cameras: dict[str, View]) -> dict[str, Any] | None:
-    """PSNR, dB, and SSIM on the test photos as they were taken, of up to 1600 pixels a side, and `size`, width and
-    height of most of them; None where none was undistorted or reduced.
+def figures_as_taken(
+    capture: Capture, renderer: SceneRenderer, cameras: dict[str, View]
+) -> dict[str, Any] | None:
+    """PSNR, dB, and SSIM on the test photos as they were taken, of up to 1600 pixels a side, and
+    `size`, width and height of most of them; None where none was undistorted or reduced.
 
     Args:    cameras: of the capture's views, by name.
-    Choices: the scene is rendered as fine as the photo is, and interpolated, by cubic splines, where its pixels lie.
-      What a photo has beyond its undistorted view, or is masked there, does not count; for SSIM it is as in the photo.
+    Choices: the scene is rendered as fine as the photo is, and interpolated, by cubic splines,
+      where its pixels lie. What a photo has beyond its undistorted view, or is masked there, does
+      not count; for SSIM it is as in the photo.
     """
     if capture.taken is None:
         return None
@@ -68,11 +78,14 @@ def figures_as_taken(capture: Capture, renderer: SceneRenderer, cameras: dict[st
         if name not in cameras:
             continue
         lens = pycolmap.Camera(model=model, params=params, width=width, height=height)
-        truth = np.ascontiguousarray(capture.taken[k][:height, :width])  # one by one: photos are large
+        # one by one: photos are large
+        truth = np.ascontiguousarray(capture.taken[k][:height, :width])
         finer = lens.mean_focal_length() / float(focals(cameras[name].K))
         view = enlarged(cameras[name], finer)
         K, render = view.K.double().numpy(), renderer.render(view)[0]
-        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
+        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(
+            -1, 2
+        )
         places = (lens.cam_from_img(pixels) @ K[:2, :2].T + K[:2, 2] - 0.5).T[::-1]
         inside = ((places >= 0) & (places <= [[view.height - 1], [view.width - 1]])).all(0)
         if capture.loss_mask is not None:
@@ -80,7 +93,10 @@ def figures_as_taken(capture: Capture, renderer: SceneRenderer, cameras: dict[st
             row, column = ((places[:, inside] + 0.5) / finer).astype(int)
             inside[inside] = mask[row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)]
         channels = np.moveaxis(render.astype(np.float32), -1, 0)
-        shown = np.stack([map_coordinates(c, places[:, inside], np.float32, mode="nearest") for c in channels], -1)
+        shown = np.stack(
+            [map_coordinates(c, places[:, inside], np.float32, mode="nearest") for c in channels],
+            -1,
+        )
         filled = truth.copy().reshape(-1, 3)
         filled[inside] = shown.round().clip(0, 255)
         per_view["psnr"].append(min(psnr(filled[inside], truth.reshape(-1, 3)[inside]), 100.0))
@@ -99,19 +115,34 @@ def enlarged(view: View, factor: float) -> View:
 
 
 def perceptual(path: Path) -> Lpips:
-    """LPIPS of a weights file, .safetensors or a .pth of tensors alone. Raises InputError naming file and remedy."""
+    """LPIPS of a weights file, .safetensors or a .pth of tensors alone. Raises InputError naming
+    file and remedy.
+    """
     if not path.is_file():
         raise InputError(f"{path} is missing; correct evaluate.lpips_weights")
     help_ = "one file with VGG-16's features.N and LPIPS' linK.model.1.weight is needed"
     try:
-        state = load_file(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
+        state = (
+            load_file(path)
+            if path.suffix == ".safetensors"
+            else torch.load(path, "cpu", weights_only=True)
+        )
         return Lpips(state)
-    except (SafetensorError, pickle.UnpicklingError, RuntimeError, EOFError, ValueError, AttributeError) as error:
+    except (
+        SafetensorError,
+        pickle.UnpicklingError,
+        RuntimeError,
+        EOFError,
+        ValueError,
+        AttributeError,
+    ) as error:
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path} holds no weights of LPIPS ({first}); {help_}") from None
 
 
-def timing(renderer: SceneRenderer, cameras: list[View], repeats: int, semantic: bool) -> dict[str, float]:
+def timing(
+    renderer: SceneRenderer, cameras: list[View], repeats: int, semantic: bool
+) -> dict[str, float]:
     """Frames a second over all views, the best of `repeats`: colour alone, and with features."""
     figures = {}
     for name, with_features in (("color", False), ("color_and_features", True)):
@@ -128,11 +159,15 @@ def timing(renderer: SceneRenderer, cameras: list[View], repeats: int, semantic:
 
 
 def frame_split(renderer: SceneRenderer, cameras: list[View], repeats: int) -> dict[str, Any]:
-    """Milliseconds of a frame in colour by part, the best sweep of `repeats` over all views, and under what."""
+    """Milliseconds of a frame in colour by part, the best sweep of `repeats` over all views, and
+    under what.
+    """
     sweeps = []
     for _ in range(repeats):
         frames = [frame_parts(renderer, view)[0] for view in cameras]
-        sweeps.append({part: 1000 * sum(parts[part] for parts in frames) / len(cameras) for part in PARTS})
+        sweeps.append(
+            {part: 1000 * sum(parts[part] for parts in frames) / len(cameras) for part in PARTS}
+        )
     size = {"width": cameras[0].width, "height": cameras[0].height}
     return min(sweeps, key=lambda sweep: sum(sweep.values())) | size | {
         "threads": numba.get_num_threads(), "device": "cpu"}  # fmt: skip

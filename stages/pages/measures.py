@@ -1,5 +1,5 @@
-"""What each stage costs and what it gets wrong: the one table of which fact of a stage is its error, and the course
-of a scene's error through its stages.
+"""What each stage costs and what it gets wrong: the one table of which fact of a stage is its
+error, and the course of a scene's error through its stages.
 """
 
 from __future__ import annotations
@@ -13,12 +13,19 @@ import numpy as np
 
 from chebsplat.formats.manifest import Manifest, measured_on
 
-PERCENT, PIXELS, DECIBELS, LEVELS, NUMBER = "{:.2%}", "{:.2f} px", "{:.2f} dB", "{:g} of 255", "{:.3g}"
+PERCENT, PIXELS, DECIBELS, LEVELS, NUMBER = (
+    "{:.2%}",
+    "{:.2f} px",
+    "{:.2f} dB",
+    "{:g} of 255",
+    "{:.3g}",
+)
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A figure of a stage. `fact` of the manifest of `role`, an input of the report; `form` shows it with its unit;
+    """A figure of a stage. `fact` of the manifest of `role`, an input of the report; `form` shows
+    it with its unit;
     lower: less is better.
     """
 
@@ -36,7 +43,9 @@ MEASURES: dict[str, tuple[Measure, ...]] = {  # by stage: its error is the first
         Measure("model", "reprojection_error_px", "points off their photos", PIXELS, lower=True),
         Measure("model", "registered", "photos that are registered", PERCENT),
     ),
-    "ingest": (Measure("capture", "variance_kept", "variance of the photos that views keep", PERCENT),),
+    "ingest": (
+        Measure("capture", "variance_kept", "variance of the photos that views keep", PERCENT),
+    ),
     "sfm": (
         Measure("points", "reprojection_error_px", "points off their photos", PIXELS, lower=True),
         Measure("points", "depth_error", "points off other views' depth", PERCENT, lower=True),
@@ -46,26 +55,60 @@ MEASURES: dict[str, tuple[Measure, ...]] = {  # by stage: its error is the first
     "channels": (Measure("channels", "relative_error", "of features lost", NUMBER, lower=True),),
     "teacher": (
         Measure("features", "right", RIGHT, PERCENT),
-        Measure("features", "mirrored_alike", "pixels with the same label in the mirrored photo", PERCENT),
+        Measure(
+            "features",
+            "mirrored_alike",
+            "pixels with the same label in the mirrored photo",
+            PERCENT,
+        ),
         Measure("agreement", "agreement", "agreement of views on points", NUMBER),
     ),
     "agree": (Measure("agreement", "agreement", "agreement of views on points", NUMBER),),
-    "describe": (Measure("descriptors", "truncation", "of distances, cut off at their degree", PERCENT, lower=True),),
-    "encode": (Measure("encoding", "rounding", "of features lost by half precision", PERCENT, lower=True),),
-    "learn": (Measure("learned", "unexplained", "of what views mean, not foretold by shape", PERCENT, lower=True),),
-    "recall": (Measure("knowledge", "unexplained", "of what rooms mean, not in the map", PERCENT, lower=True),),
+    "describe": (
+        Measure(
+            "descriptors",
+            "truncation",
+            "of distances, cut off at their degree",
+            PERCENT,
+            lower=True,
+        ),
+    ),
+    "encode": (
+        Measure("encoding", "rounding", "of features lost by half precision", PERCENT, lower=True),
+    ),
+    "learn": (
+        Measure(
+            "learned",
+            "unexplained",
+            "of what views mean, not foretold by shape",
+            PERCENT,
+            lower=True,
+        ),
+    ),
+    "recall": (
+        Measure(
+            "knowledge", "unexplained", "of what rooms mean, not in the map", PERCENT, lower=True
+        ),
+    ),
     "onnx": (Measure("encoder", "largest_difference", "from torch", NUMBER, lower=True),),
     "train": (
         Measure("gaussians", "psnr", "PSNR on watched training views", DECIBELS),
         Measure("gaussians", "right", RIGHT, PERCENT),
     ),
-    "lift": (Measure("lifted", "halves_agree", HALVES, NUMBER), Measure("lifted", "right", RIGHT, PERCENT)),
+    "lift": (
+        Measure("lifted", "halves_agree", HALVES, NUMBER),
+        Measure("lifted", "right", RIGHT, PERCENT),
+    ),
     "refine": (
         Measure("refined", "halves_agree", HALVES, NUMBER),
         Measure("refined", "gain", "more than lifting alone", NUMBER),
         Measure("refined", "right", RIGHT, PERCENT),
     ),
-    "export": (Measure("evaluation", "layout_error", "between a view's pictures by layout", LEVELS, lower=True),),
+    "export": (
+        Measure(
+            "evaluation", "layout_error", "between a view's pictures by layout", LEVELS, lower=True
+        ),
+    ),
     "evaluate": (Measure("evaluation", "psnr", "test PSNR", DECIBELS),),
 }
 
@@ -123,7 +166,10 @@ class Course(NamedTuple):
 
 
 def course_of(
-    rows: Sequence[Row], facts: Mapping[str, dict[str, Any]], trace: list[dict[str, float]], plain: float
+    rows: Sequence[Row],
+    facts: Mapping[str, dict[str, Any]],
+    trace: list[dict[str, float]],
+    plain: float,
 ) -> Course:
     """The course of a scene.
 
@@ -137,7 +183,12 @@ def course_of(
     colors = [(begin + factor * entry["seconds"], entry["psnr"]) for entry in trace]
     colors.append((ends[-1], trace[-1]["psnr"]))
     for fact, words in (("right", RIGHT), ("halves_agree", HALVES)):
-        asked = [(stage, end, of.role) for stage, _, end in spans for of in MEASURES[stage] if of.fact == fact]
+        asked = [
+            (stage, end, of.role)
+            for stage, _, end in spans
+            for of in MEASURES[stage]
+            if of.fact == fact
+        ]
         values = [(stage, end, facts.get(role, {}).get(fact)) for stage, end, role in asked]
         if meanings := [(stage, end, value) for stage, end, value in values if value is not None]:
             return Course(spans, (begin, end), plain, colors, meanings, words)
@@ -145,8 +196,8 @@ def course_of(
 
 
 def stops(course: Course) -> list[tuple[str, float, float, float | None]]:
-    """(stopped after, seconds, PSNR, meaning by then), of earlier ends and, last, of the whole; of a training that was
-    not measured so early, none within.
+    """(stopped after, seconds, PSNR, meaning by then), of earlier ends and, last, of the whole; of
+    a training that was not measured so early, none within.
     """
     begin, end = course.training
     seconds, values = zip(*course.colors, strict=True)

@@ -1,4 +1,6 @@
-"""Parts of the report's page: names and colours of labels, the headline, classes, pictures of test views."""
+"""Parts of the report's page: names and colours of labels, the headline, classes, pictures of test
+views.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,11 @@ def modes(pictures: list[dict[str, Any]]) -> list[list[Any]]:
     wrong = side("render, wrong labels in red", "renders", "wrong")
     compared: list[list[Any]] = [
         ["photo | render", side("photo", "truth"), side("render", "renders")],
-        ["true labels | scene", side("true labels", "truth", "labels"), side("scene's labels", "renders", "predicted")],
+        [
+            "true labels | scene",
+            side("true labels", "truth", "labels"),
+            side("scene's labels", "renders", "predicted"),
+        ],
         [
             "2D teacher | scene",
             side("2D teacher's labels", "truth", "teacher"),
@@ -52,11 +58,17 @@ def modes(pictures: list[dict[str, Any]]) -> list[list[Any]]:
         ],
         ["errors", errors, wrong if "wrong" in there else side("render", "renders")],
     ]
-    return [mode for mode in compared if {s[key] for s in mode[1:] for key in ("base", "over")} <= there | {None}]
+    return [
+        mode
+        for mode in compared
+        if {s[key] for s in mode[1:] for key in ("base", "over")} <= there | {None}
+    ]
 
 
 def label_names(inputs: dict[str, Path], figures: dict[str, Any]) -> list[str]:
-    """Names of the labels in the pictures: the capture's classes, or the scene's own labels where it has none."""
+    """Names of the labels in the pictures: the capture's classes, or the scene's own labels where
+    it has none.
+    """
     classes = Capture.read(inputs["capture"]).class_names if "capture" in inputs else None
     classes = classes or (figures.get("segmentation") or {}).get("classes")
     if classes is None and "scene" in inputs:
@@ -71,31 +83,53 @@ def tiles(figures: dict[str, Any], gaussians: Gaussians) -> list[tuple[str, str,
     tiles = [(f"{image['psnr']:.1f} dB", "PSNR", f"SSIM {image['ssim']:.3f}")]
     if segmentation and segmentation["scene"]["miou"] is not None:
         of_teacher = segmentation.get("teacher", {}).get("miou")
-        details = [rests(segmentation), "" if of_teacher is None else f"its 2D teacher: {of_teacher:.1%}"]
-        tiles.append((f"{segmentation['scene']['miou']:.1%}", "mIoU", "; ".join(filter(None, details))))
+        details = [
+            rests(segmentation),
+            "" if of_teacher is None else f"its 2D teacher: {of_teacher:.1%}",
+        ]
+        tiles.append(
+            (f"{segmentation['scene']['miou']:.1%}", "mIoU", "; ".join(filter(None, details)))
+        )
     if segmentation and segmentation["scene"].get("oa") is not None:
         tiles.append((f"{segmentation['scene']['oa']:.1%}", "pixels right", "overall accuracy"))
-    tiles.append((f"{figures['n_gaussians']:,}", "Gaussians", f"PLY {figures['bytes']['ply'] / 1e6:.1f} MB"))
+    tiles.append(
+        (f"{figures['n_gaussians']:,}", "Gaussians", f"PLY {figures['bytes']['ply'] / 1e6:.1f} MB")
+    )
     for name, value in list(figures["frames_per_second"].items())[:1]:
-        tiles.append((f"{value:.0f}", "frames a second", "colour alone" if name == "color" else "colour and features"))
+        tiles.append(
+            (
+                f"{value:.0f}",
+                "frames a second",
+                "colour alone" if name == "color" else "colour and features",
+            )
+        )
     last = gaussians.trace[-1]
     return [*tiles, (f"{last['seconds']:.0f} s", "training", f"{last['step']:.0f} steps")]
 
 
-def class_rows(figures: dict[str, Any], colors: dict[str, str]) -> list[tuple[str, str, float, float | None]]:
-    """(class, colour, IoU, its teacher's IoU), best first; classes that occur nowhere are not listed."""
+def class_rows(
+    figures: dict[str, Any], colors: dict[str, str]
+) -> list[tuple[str, str, float, float | None]]:
+    """(class, colour, IoU, its teacher's IoU), best first; classes that occur nowhere are not
+    listed.
+    """
     segmentation = figures.get("segmentation") or {}
     of_teacher = segmentation.get("teacher", {}).get("iou", {})
     of_scene = segmentation.get("scene", {}).get("iou", {})
     rows = [
-        (name, colors.get(name, "#999"), iou, of_teacher.get(name)) for name, iou in of_scene.items() if iou is not None
+        (name, colors.get(name, "#999"), iou, of_teacher.get(name))
+        for name, iou in of_scene.items()
+        if iou is not None
     ]
     return sorted(rows, key=lambda row: -row[2])
 
 
-def beside_truth(evaluation: Evaluation, names: list[str], inputs: dict[str, Path]) -> list[dict[str, Any]]:
-    """A row a true class that the pictures show, the most pixels first, at most IN_LEGEND: its `name`; the scene's
-    `label` that is called so, None without one; its `share` of the labelled pixels; of its pixels what they are
+def beside_truth(
+    evaluation: Evaluation, names: list[str], inputs: dict[str, Path]
+) -> list[dict[str, Any]]:
+    """A row a true class that the pictures show, the most pixels first, at most IN_LEGEND: its
+    `name`; the scene's `label` that is called so, None without one; its `share` of the labelled
+    pixels; of its pixels what they are
     `taken` for: (name, share) of the classes of all rows, in their order, and of anything else.
     """
     pictures = evaluation.pictures
@@ -108,28 +142,42 @@ def beside_truth(evaluation: Evaluation, names: list[str], inputs: dict[str, Pat
         matrix += confusion(np.where(labels < 0, n, labels), pictures["labels"][view], n + 1)[:-1]
     pixels = matrix.sum(1)
     kept = [int(k) for k in np.argsort(-pixels, kind="stable")[:IN_LEGEND] if pixels[k]]
-    known = read_label_names(inputs["scene"], read_manifest(inputs["scene"])) if "scene" in inputs else names
+    known = (
+        read_label_names(inputs["scene"], read_manifest(inputs["scene"]))
+        if "scene" in inputs
+        else names
+    )
     rows = dict(zip(kept, rows_of([names[k] for k in kept], known), strict=True))
     found = []
     for k in kept:
         shares = matrix[k, kept] / pixels[k]
-        taken = [*zip([names[other] for other in kept], shares, strict=True), ("anything else", 1 - shares.sum())]
+        taken = [
+            *zip([names[other] for other in kept], shares, strict=True),
+            ("anything else", 1 - shares.sum()),
+        ]
         label = known[rows[k]] if rows[k] >= 0 else None
-        found.append({"name": names[k], "label": label, "share": pixels[k] / pixels.sum(), "taken": taken})
+        found.append(
+            {"name": names[k], "label": label, "share": pixels[k] / pixels.sum(), "taken": taken}
+        )
     return found
 
 
 def legend(pixels: Counter[int], names: list[str], colors: dict[str, str]) -> list[tuple[str, str]]:
-    """(name, colour) of the labels that cover the most pixels, in their order, and how many more there are."""
+    """(name, colour) of the labels that cover the most pixels, in their order, and how many more
+    there are.
+    """
     kept = sorted(label for label, _ in pixels.most_common(IN_LEGEND))
     more = len(pixels) - len(kept)
-    return [(names[k], colors[names[k]]) for k in kept] + ([(f"and {more} more", "transparent")] if more else [])
+    return [(names[k], colors[names[k]]) for k in kept] + (
+        [(f"and {more} more", "transparent")] if more else []
+    )
 
 
 def picture_rows(
     evaluation: Evaluation, names: list[str], count: int, out: Path
 ) -> tuple[list[dict[str, Any]], Counter[int]]:
-    """Pictures (key, URI, caption) of evenly spaced views, and pixels of each label in them; a PNG of the first.
+    """Pictures (key, URI, caption) of evenly spaced views, and pixels of each label in them; a PNG
+    of the first.
 
     Raises: InputError if a picture holds a label that has no name.
     """
@@ -143,17 +191,29 @@ def picture_rows(
     pixels: Counter[int] = Counter()
     for k in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int)):
         truth, render = pictures["truth"][k], pictures["renders"][k]
-        maps = {kind: pictures[kind][k] for kind in ("labels", "teacher", "predicted") if kind in pictures}
+        maps = {
+            kind: pictures[kind][k]
+            for kind in ("labels", "teacher", "predicted")
+            if kind in pictures
+        }
         for labels in maps.values():
             pixels.update(counted(labels))
         if max(pixels, default=-1) >= len(names):
-            raise InputError(f"label {max(pixels)} in the pictures has no name; pass --in-capture, or evaluate again")
-        images = [("truth", draw.data_uri(truth, photo=True)), ("renders", draw.data_uri(render, photo=True))]
+            raise InputError(
+                f"label {max(pixels)} in the pictures has no name; pass "
+                "--in-capture, or evaluate again"
+            )
+        images = [
+            ("truth", draw.data_uri(truth, photo=True)),
+            ("renders", draw.data_uri(render, photo=True)),
+        ]
         images.append(("error", draw.data_uri(draw.error_map(render, truth), photo=True)))
         colored = {kind: draw.colored(labels, len(names)) for kind, labels in maps.items()}
         images += [(kind, draw.data_uri(image)) for kind, image in colored.items()]
         if {"labels", "predicted"} <= maps.keys():
-            images.append(("wrong", draw.data_uri(draw.wrong_map(maps["predicted"], maps["labels"]))))
+            images.append(
+                ("wrong", draw.data_uri(draw.wrong_map(maps["predicted"], maps["labels"])))
+            )
         captions = CAPTIONS | {"renders": f"render, {per_view[k]:.1f} dB"}
         named = [(key, uri, captions[key]) for key, uri in images]
         rows.append({"name": f"{views[k]}, {per_view[k]:.1f} dB", "images": named})
@@ -169,7 +229,11 @@ def counted(labels: np.ndarray) -> dict[int, int]:
 
 
 def rendered(template: Path, narrow: int = 700, **values: Any) -> str:
-    """A page of its template. Raises jinja2's UndefinedError for a value that it wants and is not given."""
+    """A page of its template. Raises jinja2's UndefinedError for a value that it wants and is not
+    given.
+    """
     loader = jinja2.FileSystemLoader([template.parent, SHARED])
-    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
+    environment = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined
+    )
     return environment.get_template(template.name).render(narrow=narrow, **values)

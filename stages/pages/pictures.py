@@ -27,7 +27,10 @@ NAMED = {"psnr": "PSNR", "loss_color": "colour", "loss_features": "features"}
 
 def palette(n: int) -> np.ndarray:
     """n distinguishable colours, u8 [n, 3]; hues by the golden ratio."""
-    rows = [colorsys.hsv_to_rgb(0.618034 * k % 1, (0.55, 0.8)[k % 2], (0.95, 0.7, 0.85)[k % 3]) for k in range(n)]
+    rows = [
+        colorsys.hsv_to_rgb(0.618034 * k % 1, (0.55, 0.8)[k % 2], (0.95, 0.7, 0.85)[k % 3])
+        for k in range(n)
+    ]
     return (np.array(rows).reshape(n, 3) * 255).astype(np.uint8)
 
 
@@ -37,11 +40,15 @@ def colored(labels: np.ndarray, n: int) -> np.ndarray:
 
 
 def heat(image: np.ndarray, relevancy: np.ndarray) -> np.ndarray:
-    """A render u8 [H, W, 3] under the heat of a relevancy [H, W]: grey up to 0.5, then cyan to red at 1."""
+    """A render u8 [H, W, 3] under the heat of a relevancy [H, W]: grey up to 0.5, then cyan to red
+    at 1.
+    """
     grey = image.mean(-1, keepdims=True)
     warmth = (2 * relevancy - 1).clip(0, 1)[..., None]
     opacity = np.where(warmth > 0, 0.5 + 0.4 * warmth, 0)
-    return np.round((1 - opacity) * 0.8 * grey + opacity * (0.7 + 0.3 * grey / 255) * warm(warmth)).astype(np.uint8)
+    return np.round(
+        (1 - opacity) * 0.8 * grey + opacity * (0.7 + 0.3 * grey / 255) * warm(warmth)
+    ).astype(np.uint8)
 
 
 def warm(warmth: np.ndarray) -> np.ndarray:
@@ -56,7 +63,9 @@ def error_map(image: np.ndarray, truth: np.ndarray, gain: float = 4.0) -> np.nda
 
 
 def wrong_map(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Red, u8 [H, W, 4], where predicted classes are wrong; clear where they are right or nothing is known."""
+    """Red, u8 [H, W, 4], where predicted classes are wrong; clear where they are right or nothing
+    is known.
+    """
     wrong = (predicted != truth) & (truth != IGNORE)
     return np.where(wrong[..., None], np.array([230, 20, 40, 255], np.uint8), np.uint8(0))
 
@@ -70,7 +79,10 @@ def data_uri(image: np.ndarray, photo: bool = False) -> str:
         if image.shape[-1] == 3:
             picture = picture.quantize(256, dither=Image.Dither.NONE)
         picture.save(buffer, "PNG", optimize=True)
-    return f"data:image/{'webp' if photo else 'png'};base64," + base64.b64encode(buffer.getvalue()).decode()
+    return (
+        f"data:image/{'webp' if photo else 'png'};base64,"
+        + base64.b64encode(buffer.getvalue()).decode()
+    )
 
 
 def png(image: np.ndarray, path: Any) -> None:
@@ -90,7 +102,8 @@ def svg(figure: Any) -> str:
 def cameras(eyes: np.ndarray, ups: np.ndarray, points: np.ndarray, errors: np.ndarray) -> str:
     """Cameras and points from above and from the side, and each photo's error, as inline SVG.
 
-    Args: eyes, ups: [V, 3] places of the cameras and what is up to each, in the order of the photos; points [N, 3];
+    Args: eyes, ups: [V, 3] places of the cameras and what is up to each, in the order of the
+      photos; points [N, 3];
           errors: [V] pixels.
     """
     matplotlib.use("Agg")
@@ -100,9 +113,13 @@ def cameras(eyes: np.ndarray, ups: np.ndarray, points: np.ndarray, errors: np.nd
     near = np.abs(points - np.median(points, 0)).max(1) if len(points) else np.zeros(0)
     shown = points[near <= np.quantile(near, 0.95)] @ axes if len(points) else np.zeros((0, 3))
     shown, placed = shown[:: max(len(shown) // 1500, 1)], eyes @ axes
-    with matplotlib.rc_context({"svg.hashsalt": "cameras", "svg.fonttype": "none", "font.family": "sans-serif"}):
+    with matplotlib.rc_context(
+        {"svg.hashsalt": "cameras", "svg.fonttype": "none", "font.family": "sans-serif"}
+    ):
         figure, panels = plt.subplots(1, 3, figsize=(12.6, 3.4), layout="constrained")
-        for panel, (i, j), title in zip(panels, ((0, 1), (0, 2)), ("from above", "from the side"), strict=False):
+        for panel, (i, j), title in zip(
+            panels, ((0, 1), (0, 2)), ("from above", "from the side"), strict=False
+        ):
             panel.scatter(*shown[:, [i, j]].T, s=1, color="#999999", linewidths=0)
             panel.plot(*placed[:, [i, j]].T, color="#cccccc", linewidth=0.5)
             panel.scatter(*placed[:, [i, j]].T, s=14, c=np.arange(len(placed)), cmap="viridis")
@@ -116,24 +133,46 @@ def cameras(eyes: np.ndarray, ups: np.ndarray, points: np.ndarray, errors: np.nd
 
 
 def course(of: Course, test_psnr: float) -> str:
-    """What a scene would have been, had it been left earlier, as inline SVG: PSNR and what its labels are worth
-    against the seconds from the start, over bands of its stages.
+    """What a scene would have been, had it been left earlier, as inline SVG: PSNR and what its
+    labels are worth against the seconds from the start, over bands of its stages.
     """
     matplotlib.use("Agg")
-    with matplotlib.rc_context({"svg.hashsalt": "course", "svg.fonttype": "none", "font.family": "sans-serif"}):
+    with matplotlib.rc_context(
+        {"svg.hashsalt": "course", "svg.fonttype": "none", "font.family": "sans-serif"}
+    ):
         n = 2 if of.meanings else 1
-        figure, panels = plt.subplots(n, 1, figsize=(12.6, 2.6 * n), layout="constrained", sharex=True, squeeze=False)
+        figure, panels = plt.subplots(
+            n, 1, figsize=(12.6, 2.6 * n), layout="constrained", sharex=True, squeeze=False
+        )
         last = max(of.spans[-1][2], 1e-3)
         for number, (stage, begin, end) in enumerate(of.spans):
             for panel in panels[:, 0]:
-                panel.axvspan(begin, end, color=colormaps["tab20"](2 * number % 20 + 1), alpha=0.35, linewidth=0)
+                panel.axvspan(
+                    begin,
+                    end,
+                    color=colormaps["tab20"](2 * number % 20 + 1),
+                    alpha=0.35,
+                    linewidth=0,
+                )
             if end - begin > 0.035 * last:
                 top = panels[0, 0].get_xaxis_transform()
-                panels[0, 0].text((begin + end) / 2, 1.02, stage, transform=top, ha="center", fontsize=8)
-        panels[0, 0].plot([0, of.training[0]], [of.plain] * 2, ":", color="#1f6feb", label="photos of one colour")
+                panels[0, 0].text(
+                    (begin + end) / 2, 1.02, stage, transform=top, ha="center", fontsize=8
+                )
+        panels[0, 0].plot(
+            [0, of.training[0]], [of.plain] * 2, ":", color="#1f6feb", label="photos of one colour"
+        )
         panels[0, 0].plot(*zip(*of.colors, strict=True), color="#1f6feb", marker=".", markersize=4,
                           label="training views")  # fmt: skip
-        panels[0, 0].plot([last], [test_psnr], "*", color="#e36209", markersize=11, label="test views", clip_on=False)
+        panels[0, 0].plot(
+            [last],
+            [test_psnr],
+            "*",
+            color="#e36209",
+            markersize=11,
+            label="test views",
+            clip_on=False,
+        )
         panels[0, 0].set_ylabel("PSNR, dB")
         panels[0, 0].legend(fontsize=8, frameon=False, loc="lower right")
         if of.meanings:
@@ -142,7 +181,12 @@ def course(of: Course, test_psnr: float) -> str:
             for k, at in enumerate(zip(seconds, values, strict=True)):
                 text = f"{stages[k]} {values[k]:.3f}"
                 panels[1, 0].annotate(
-                    text, at, (0, (7, -14)[k % 2]), ha="right", fontsize=8, textcoords="offset points"
+                    text,
+                    at,
+                    (0, (7, -14)[k % 2]),
+                    ha="right",
+                    fontsize=8,
+                    textcoords="offset points",
                 )
             panels[1, 0].margins(y=0.3)
             panels[1, 0].set_ylabel(textwrap.fill(of.words, 32), fontsize=8)
@@ -152,20 +196,38 @@ def course(of: Course, test_psnr: float) -> str:
 
 
 def curves(trace: list[dict[str, float]], test_psnr: float) -> list[str]:
-    """Error against run time as inline SVG: PSNR with the test views' at the end, losses, number of Gaussians."""
+    """Error against run time as inline SVG: PSNR with the test views' at the end, losses, number of
+    Gaussians.
+    """
     matplotlib.use("Agg")
 
     seconds = [row["seconds"] for row in trace]
     drawn = []
     for columns, title in CURVES:
-        with matplotlib.rc_context({"svg.hashsalt": title, "svg.fonttype": "none", "font.family": "sans-serif"}):
+        with matplotlib.rc_context(
+            {"svg.hashsalt": title, "svg.fonttype": "none", "font.family": "sans-serif"}
+        ):
             figure, axis = plt.subplots(figsize=(4.2, 2.9), layout="constrained")
             for color, column in zip(("#1f6feb", "#e36209"), columns, strict=False):
                 if any(row.get(column) for row in trace):
                     values = [row[column] or np.nan for row in trace]
-                    axis.plot(seconds, values, color=color, marker=".", markersize=4, label=NAMED.get(column))
+                    axis.plot(
+                        seconds,
+                        values,
+                        color=color,
+                        marker=".",
+                        markersize=4,
+                        label=NAMED.get(column),
+                    )
             if columns == ("psnr",):
-                axis.plot(seconds[-1:], [test_psnr], "*", color="#e36209", markersize=11, label="test views")
+                axis.plot(
+                    seconds[-1:],
+                    [test_psnr],
+                    "*",
+                    color="#e36209",
+                    markersize=11,
+                    label="test views",
+                )
             if columns != ("n",):
                 axis.legend(fontsize=8, frameon=False)
             if columns[0].startswith("loss"):

@@ -25,7 +25,11 @@ def started(inputs: dict[str, Path], facts: dict[str, dict[str, Any]]) -> Starte
         return None
     document = read_card(inputs["knowledge"])
     card, solved = document["card"], document["lessons"]
-    taught = f"taught over {card['n_rooms']} generated rooms" if "n_rooms" in card else document["teacher"]
+    taught = (
+        f"taught over {card['n_rooms']} generated rooms"
+        if "n_rooms" in card
+        else document["teacher"]
+    )
     rows = [("the encoder of shape", taught)]
     of = solved.get("of", [])
     used = sum(lesson["trust"] > 0 for lesson in of)
@@ -40,7 +44,9 @@ def started(inputs: dict[str, Path], facts: dict[str, dict[str, Any]]) -> Starte
 
 
 def worth(refined: dict[str, Any]) -> list[tuple[str, str]]:
-    """What knowledge was worth: how far half the training views foretell the other half, without it and with it."""
+    """What knowledge was worth: how far half the training views foretell the other half, without it
+    and with it.
+    """
     if "curve" not in refined:
         return []
     curve, belief = refined["curve"]["off"], refined["believed"]
@@ -49,12 +55,16 @@ def worth(refined: dict[str, Any]) -> list[tuple[str, str]]:
         return [("worth on training views held out", "not told: it counts for nothing here")]
     agreed = f"agreement {curve['0']:.4f} without it, {curve[strength]:.4f} with it"
     views = "1 view" if strength == "1" else f"{strength} views"
-    views += "" if belief == 1 else f", of which {belief:.0%} is believed: the teacher says otherwise"
+    views += (
+        "" if belief == 1 else (f", of which {belief:.0%} is believed: the teacher says otherwise")
+    )
     return [("worth on training views held out", f"{agreed}, counting as {views}")]
 
 
 def left_behind(lesson: dict[str, Any]) -> list[tuple[str, str]]:
-    """What the scene adds, by what later scenes trust it, and whether it is of a kind that was not known."""
+    """What the scene adds, by what later scenes trust it, and whether it is of a kind that was not
+    known.
+    """
     if "rho" not in lesson:
         return []
     figures = f"ρ {lesson['rho']:.3f}, σ_f {lesson['sigma']:.3f}, ρ′ {lesson['novelty']:.3f}"
@@ -63,9 +73,15 @@ def left_behind(lesson: dict[str, Any]) -> list[tuple[str, str]]:
     added = f"{lesson['n_points']:,} points, {lesson['n_labels']} labels"
     if lesson["unnamed"]:
         added += f"; without a word, and so not learned: {', '.join(lesson['unnamed'])}"
-    alike = f"shape has {lesson['alike']:.0%} of its labels alike, and is {lesson['familiar']:.2f} as sure"
+    alike = (
+        f"shape has {lesson['alike']:.0%} of its labels alike, and is "
+        f"{lesson['familiar']:.2f} as sure"
+    )
     return [
         ("novelty of this scene (Eq 15)", figures),
         ("what this scene adds", added),
-        ("by which later scenes trust it", f"its labels were given; {alike}" if lesson["given"] else alike),
+        (
+            "by which later scenes trust it",
+            f"its labels were given; {alike}" if lesson["given"] else alike,
+        ),
     ]

@@ -1,4 +1,6 @@
-"""Poses that a sensor gave, made to agree with the photos: bundle adjustment over triangulated features by pycolmap."""
+"""Poses that a sensor gave, made to agree with the photos: bundle adjustment over triangulated
+features by pycolmap.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +18,20 @@ from chebsplat.stages.runtime.command import Job
 
 log = logging.getLogger("chebsplat")
 
-ROUNDS = (48.0, 16.0, 4.0, 2.0)  # pixels that a point may miss its features by, each time it is triangulated
+# pixels that a point may miss its features by, each time it is triangulated
+ROUNDS = (48.0, 16.0, 4.0, 2.0)
 FREE = 2  # of these, after which the photos alone have moved the poses about right
 SHARED = 30  # points that a view must see for its pose to be adjusted
-ENOUGH = 0.8  # part of the views that must see so many: poses that are adjusted and poses that are not do not mix
+# part of the views that must see so many: poses that are adjusted and poses that are not do not mix
+ENOUGH = 0.8
 ASTRAY = 4.0  # times the median, that a view has moved by, from which on it is not believed
 MEDIAN_OF_3 = 1.538  # of the length of a vector whose three coordinates have a spread of 1
 
 
 class Frame(NamedTuple):
-    """The world of the given poses as those found tell it: scale, rotation [3, 3] and shift [3] into it; led [V] bool:
-    views that see enough points and have not gone astray; spread: how far these have turned (radians) and moved (scene
-    units), each coordinate's standard deviation.
+    """The world of the given poses as those found tell it: scale, rotation [3, 3] and shift [3]
+    into it; led [V] bool: views that see enough points and have not gone astray; spread: how far
+    these have turned (radians) and moved (scene units), each coordinate's standard deviation.
     """
 
     scale: float
@@ -40,18 +44,21 @@ class Frame(NamedTuple):
 def adjust(
     job: Job, model: pycolmap.Reconstruction, database: Path, names: list[str], given: np.ndarray
 ) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
-    """Poses and focal lengths that the matched features of all views agree on, in the frame of the given poses.
+    """Poses and focal lengths that the matched features of all views agree on, in the frame of the
+    given poses.
 
     Args:
       model:    cameras and given poses; database: with matches.
       names:    of the model's images, with their poses `given` [V, 4, 4].
-    Returns: the model with its points, and notes: how far poses moved, focal lengths and errors before and after.
-    Choices: triangulation and bundle adjustment by turns (`ROUNDS`), under a soft L1 loss of a pixel; the principal
-      point stays. The frame is that of the mean rotation, and of the centres under it, of the poses that were given,
-      their units with it. After FREE rounds it is known how far given poses are off: from then on centres are held by
-      them with that spread, views that see few points or were moved much farther than the others begin anew from where
-      they were given, and those that are so at the end are found among the points of the others (`localized`). Where
-      too many views see few points, all keep their poses.
+    Returns: the model with its points, and notes: how far poses moved, focal lengths and errors
+      before and after.
+    Choices: triangulation and bundle adjustment by turns (`ROUNDS`), under a soft L1 loss of a
+      pixel; the principal point stays. The frame is that of the mean rotation, and of the centres
+      under it, of the poses that were given, their units with it. After FREE rounds it is known how
+      far given poses are off: from then on centres are held by them with that spread, views that
+        see few points or were moved much farther than the others begin anew from where
+      they were given, and those that are so at the end are found among the points of the others
+      (`localized`). Where too many views see few points, all keep their poses.
     """
     focal, errors, as_given = _focals(model), [], model
     out = job.scratch / "adjusted"
@@ -75,24 +82,39 @@ def adjust(
         seen = np.array([image.num_points3D >= SHARED for image in images])
         framed = frame(_poses(images), given, seen) if seen.mean() >= ENOUGH else None
         if framed is not None:
-            model.transform(pycolmap.Sim3d(framed.scale, pycolmap.Rotation3d(framed.rotation), framed.shift))
+            model.transform(
+                pycolmap.Sim3d(framed.scale, pycolmap.Rotation3d(framed.rotation), framed.shift)
+            )
             for row in np.flatnonzero(~framed.led):
                 _put(images[row], given[row, :3])
     if framed is None:
-        log.warning("poses stay as given: %d of %d views share %d points or more", seen.sum(), len(seen), SHARED)
+        log.warning(
+            "poses stay as given: %d of %d views share %d points or more",
+            seen.sum(),
+            len(seen),
+            SHARED,
+        )
         return as_given, {"poses_kept": len(names)}
     others = [image for image, led in zip(images, framed.led, strict=True) if led]
     for row in np.flatnonzero(~framed.led):
-        _put(images[row], localized(model, database, images[row], given[row], framed.spread, others))
+        _put(
+            images[row], localized(model, database, images[row], given[row], framed.spread, others)
+        )
     model.update_point_3d_errors()
     notes = _notes(model, framed, differences(_poses(images), given), focal, errors[0])
     return model, notes
 
 
 def _notes(
-    model: pycolmap.Reconstruction, framed: Frame, found: tuple[np.ndarray, ...], focal: float, error: float
+    model: pycolmap.Reconstruction,
+    framed: Frame,
+    found: tuple[np.ndarray, ...],
+    focal: float,
+    error: float,
 ) -> dict[str, Any]:
-    """What the adjustment has changed. found: how far each view moved and turned; focal, error: before, in pixels."""
+    """What the adjustment has changed. found: how far each view moved and turned; focal, error:
+    before, in pixels.
+    """
     moved, turned = (values[framed.led] for values in found)
     notes = {
         "poses_moved": float(np.median(moved)),
@@ -102,7 +124,8 @@ def _notes(
         "reprojection_error_given_px": error,
     }
     log.info(
-        "poses adjusted to the photos: moved by %.3g scene units and %.2g° (medians), %d of %d held near the given; "
+        "poses adjusted to the photos: moved by %.3g scene units and %.2g° (medians), %d of %d "
+        "held near the given; "
         "focal length %.1f -> %.1f px; reprojection error %.2f -> %.2f px",
         *(notes[name] for name in ("poses_moved", "poses_turned_degrees", "poses_kept")), len(framed.led),
         focal, _focals(model), error, model.compute_mean_reprojection_error(),
@@ -114,13 +137,18 @@ def _triangulation(allowed: float) -> pycolmap.IncrementalPipelineOptions:
     """Options under which a point may miss its features by so many pixels."""
     options = pycolmap.IncrementalPipelineOptions()
     options.mapper.filter_max_reproj_error = allowed
-    options.triangulation.create_max_angle_error = options.triangulation.continue_max_angle_error = allowed / 4 + 1
-    options.triangulation.complete_max_reproj_error = options.triangulation.merge_max_reproj_error = allowed
+    options.triangulation.create_max_angle_error = (
+        options.triangulation.continue_max_angle_error
+    ) = allowed / 4 + 1
+    options.triangulation.complete_max_reproj_error = (
+        options.triangulation.merge_max_reproj_error
+    ) = allowed
     return options
 
 
 def frame(found: np.ndarray, given: np.ndarray, seen: np.ndarray) -> Frame:
-    """The world of the poses `given` [V, 4, 4] as those `found` [V, 4, 4] tell it, of views `seen` [V] bool.
+    """The world of the poses `given` [V, 4, 4] as those `found` [V, 4, 4] tell it, of views `seen`
+    [V] bool.
 
     Choices: `alignment` of all, then twice of those that have not gone astray.
     """
@@ -135,11 +163,15 @@ def frame(found: np.ndarray, given: np.ndarray, seen: np.ndarray) -> Frame:
         usual = max(np.median(moved[led]), 1e-12), max(np.median(turned[led]), 1e-12)
         near = (moved <= ASTRAY * usual[0]) & (turned <= ASTRAY * usual[1]) & seen
         led = near if near.sum() > len(seen) / 2 else led
-    return Frame(scale, rotation, shift, led, (float(usual[1]) / MEDIAN_OF_3, float(usual[0]) / MEDIAN_OF_3))
+    return Frame(
+        scale, rotation, shift, led, (float(usual[1]) / MEDIAN_OF_3, float(usual[0]) / MEDIAN_OF_3)
+    )
 
 
 def differences(poses: np.ndarray, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far apart poses [V, 4, 4] are: of their centres, scene units [V], and of their rotations, radians [V]."""
+    """How far apart poses [V, 4, 4] are: of their centres, scene units [V], and of their rotations,
+    radians [V].
+    """
     turns = Rotation.from_matrix(np.einsum("vij,vkj->vik", poses[:, :3, :3], given[:, :3, :3]))
     return np.linalg.norm(centers(poses) - centers(given), axis=1), turns.magnitude()
 
@@ -152,10 +184,13 @@ def localized(
     spread: tuple[float, float],
     others: list[pycolmap.Image],
 ) -> np.ndarray:
-    """The pose [3, 4] of an image by its matches with points of the `others`, near its given pose [4, 4].
+    """The pose [3, 4] of an image by its matches with points of the `others`, near its given pose
+    [4, 4].
 
-    Args: spread: each turn's (radians) and shift's (scene units) standard deviation about the given pose.
-    Choices: the least sum of what its features miss these points by, pixels under a Cauchy loss, and of the pose's
+    Args: spread: each turn's (radians) and shift's (scene units) standard deviation about the given
+      pose.
+    Choices: the least sum of what its features miss these points by, pixels under a Cauchy loss,
+      and of the pose's
       change in units of `spread`: where there are no matches, or they lead astray, the pose is
       the given one.
     """
@@ -165,7 +200,9 @@ def localized(
             if opened.exists_two_view_geometry(image.image_id, other.image_id):
                 pairs = opened.read_two_view_geometry(image.image_id, other.image_id).inlier_matches
                 both = [
-                    (mine, other.points2D[its].point3D_id) for mine, its in pairs if other.points2D[its].has_point3D()
+                    (mine, other.points2D[its].point3D_id)
+                    for mine, its in pairs
+                    if other.points2D[its].has_point3D()
                 ]
                 pixels += [image.points2D[mine].xy for mine, _ in both]
                 points += [model.points3D[point].xyz for _, point in both]
@@ -190,10 +227,11 @@ def localized(
 
 
 def alignment(found: np.ndarray, given: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation [3, 3] and shift [3] from the world of poses `found` to that of `given`, both [V, 4, 4].
+    """Scale, rotation [3, 3] and shift [3] from the world of poses `found` to that of `given`, both
+    [V, 4, 4].
 
-    Choices: the rotation is the mean over views, not that of the centres, which tell none where they lie on a line. The
-      scale is 1 where all centres lie in one place.
+    Choices: the rotation is the mean over views, not that of the centres, which tell none where
+      they lie on a line. The scale is 1 where all centres lie in one place.
     """
     U, _, Vt = np.linalg.svd(np.einsum("vji,vjk->ik", given[:, :3, :3], found[:, :3, :3]))
     rotation = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
@@ -236,7 +274,9 @@ def _bundle_near(
     options: pycolmap.BundleAdjustmentOptions,
     spread: float,
 ) -> None:
-    """Bundle adjustment in which the given centres have a say: each coordinate's standard deviation is `spread`."""
+    """Bundle adjustment in which the given centres have a say: each coordinate's standard deviation
+    is `spread`.
+    """
     config, priors = pycolmap.BundleAdjustmentConfig(), []
     for image, place in zip(images, centers(given), strict=True):
         config.add_image(image.image_id)

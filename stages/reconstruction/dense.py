@@ -1,5 +1,5 @@
-"""Points beside those that were matched: depth of the photos by a plane sweep, where several views agree on it; and far
-behind all of them, where a photo shows what no point is known of.
+"""Points beside those that were matched: depth of the photos by a plane sweep, where several views
+agree on it; and far behind all of them, where a photo shows what no point is known of.
 """
 
 from __future__ import annotations
@@ -25,25 +25,38 @@ from chebsplat.stages.settings import SfmSection
 log = logging.getLogger("chebsplat")
 
 SIDE = 160  # pixels of the longer side that photos are reduced to
-DEPTHS, NEIGHBORS = 96, 8  # depths that are tried, evenly spaced in 1 / z; views that each is compared with
+# depths that are tried, evenly spaced in 1 / z; views that each is compared with
+DEPTHS, NEIGHBORS = 96, 8
 WITNESSES = 64  # views, the nearest, that confirm or deny what a view has found
-NEAR, FAR = 0.7, 5.0  # of the nearest point in a photo (1st percentile), and of the farthest one in any (99th)
+# of the nearest point in a photo (1st percentile), and of the farthest one in any (99th)
+NEAR, FAR = 0.7, 5.0
 MOST_COST, AGREE = 0.5, 2  # what counts: cost, views that confirm a depth
-LEAST = 0.2  # of the points in the cube of a middling one, and three: what few pixels show is seldom there
+# of the points in the cube of a middling one, and three: what few pixels show is seldom there
+LEAST = 0.2
 MOST = 12_000  # points in all: the first Gaussians, which growth needs room beside
 CELLS = 20  # cells along the longer side of a photo, of which it is asked how many hold a point
-FACING = 0.25  # of the pairs of cameras: of photos from all around something .35, of five other captures at most .2
+# of the pairs of cameras: of photos from all around something .35, of five other captures at most
+# .2
+FACING = 0.25
 BEHIND = 1.5  # times the farthest point: how deep what no point is known of is supposed to lie
 COVERED = 0.8  # part of the cells under which matched points leave too much of the photos empty
 
 
 def covered(Ks: np.ndarray, poses: np.ndarray, means: np.ndarray, size: tuple[int, int]) -> float:
-    """The share of the views' cells, CELLS along the longer side of `size`, in which a point [N, 3] lies."""
-    return float(np.mean([cells_with(K, pose, means, size) for K, pose in zip(Ks, poses, strict=True)]))
+    """The share of the views' cells, CELLS along the longer side of `size`, in which a point [N, 3]
+    lies.
+    """
+    return float(
+        np.mean([cells_with(K, pose, means, size) for K, pose in zip(Ks, poses, strict=True)])
+    )
 
 
-def cells_with(K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Which cells of a photo of `size` (width, height) a point [N, 3] lies in, bool [rows, columns]."""
+def cells_with(
+    K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """Which cells of a photo of `size` (width, height) a point [N, 3] lies in, bool [rows,
+    columns].
+    """
     edge = max(size) / CELLS
     held = np.zeros((math.ceil(size[1] / edge), math.ceil(size[0] / edge)), bool)
     column, row = (in_photo(K, pose, means, size)[:, :2] // edge).astype(int).T
@@ -51,8 +64,12 @@ def cells_with(K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[i
     return held
 
 
-def in_photo(K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Pixels and depth [M, 3] of those of the points [N, 3] that lie in a photo of `size` (width, height)."""
+def in_photo(
+    K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """Pixels and depth [M, 3] of those of the points [N, 3] that lie in a photo of `size` (width,
+    height).
+    """
     camera = means @ pose[:3, :3].T + pose[:3, 3]
     camera = camera[camera[:, 2] > 0]
     pixels = (camera @ K.T)[:, :2] / camera[:, 2:]
@@ -61,7 +78,8 @@ def in_photo(K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[int
 
 
 def wants_more(job: Job, capture: Capture, cloud: dict[str, Any], settings: SfmSection) -> bool:
-    """Whether points are added to a cloud, as `sfm.dense` says: to those that leave much of the photos empty.
+    """Whether points are added to a cloud, as `sfm.dense` says: to those that leave much of the
+    photos empty.
 
     Choices: depth that a capture brings, and generated views, which have it, need none of this.
     """
@@ -74,11 +92,12 @@ def wants_more(job: Job, capture: Capture, cloud: dict[str, Any], settings: SfmS
 
 
 def swept(job: Job, capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
-    """means, colors and seen_from of points that a plane sweep of the training views finds, as a cloud has them, and
-    depths f32 [V, h, w] of the cloud's views, 0 where they do not agree, of photos reduced to SIDE.
+    """means, colors and seen_from of points that a plane sweep of the training views finds, as a
+    cloud has them, and depths f32 [V, h, w] of the cloud's views, 0 where they do not agree, of
+    photos reduced to SIDE.
 
-    Choices: test views give no points, and have no depth. Depths that are tried begin before what is in the photo:
-      points behind its edges, beside the camera, would have all of them end there.
+    Choices: test views give no points, and have no depth. Depths that are tried begin before what
+      is in the photo: points behind its edges, beside the camera, would have all of them end there.
     """
     row = {name: k for k, name in enumerate(capture.names)}
     rows = np.array([row[name] for name in cloud["names"]])
@@ -87,9 +106,14 @@ def swept(job: Job, capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
     small = np.stack([reduced(capture.images[view], factor) for view in rows[used]]) / 255
     valid = np.ones(small.shape[:3], np.float32)
     if capture.loss_mask is not None:
-        valid = np.stack([reduced(capture.loss_mask[view][..., None], factor)[..., 0] for view in rows[used]])
+        valid = np.stack(
+            [reduced(capture.loss_mask[view][..., None], factor)[..., 0] for view in rows[used]]
+        )
     poses, Ks = cloud["cam_from_world"][used], cloud["Ks"][used].copy()
-    z = [in_photo(K, pose, cloud["means"], capture.size)[:, 2] for K, pose in zip(Ks, poses, strict=True)]
+    z = [
+        in_photo(K, pose, cloud["means"], capture.size)[:, 2]
+        for K, pose in zip(Ks, poses, strict=True)
+    ]
     Ks[:, :2] /= factor
     found = depth_of_photos(small, valid, Ks, poses, z, job.progress)
     depths = np.zeros((len(rows), *small.shape[1:3]), np.float32)
@@ -103,7 +127,12 @@ def swept(job: Job, capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
     points = fused(np.concatenate(means), np.concatenate(colors), np.concatenate(seen))
     total, count = sum(map(len, means)), len(points["means"])
     share = total / max(found.size, 1)
-    log.info("a sweep of %d photos finds %.0f %% of their pixels' depth, %d points", len(used), 100 * share, count)
+    log.info(
+        "a sweep of %d photos finds %.0f %% of their pixels' depth, %d points",
+        len(used),
+        100 * share,
+        count,
+    )
     job.facts["swept"] = round(share, 3)
     return points | {"depths": depths}
 
@@ -116,16 +145,20 @@ def depth_of_photos(
     z: list[np.ndarray],
     progress: Progress | None = None,
 ) -> np.ndarray:
-    """Depth f32 [V, h, w] of photos, 0 where none is known: by a plane sweep, and by planes where there is no texture.
+    """Depth f32 [V, h, w] of photos, 0 where none is known: by a plane sweep, and by planes where
+    there is no texture.
 
-    Args:    colors f32 [V, h, w, 3] in [0, 1]; valid [V, h, w]: 1 where a pixel counts; Ks [V, 3, 3] in its pixels;
+    Args:    colors f32 [V, h, w, 3] in [0, 1]; valid [V, h, w]: 1 where a pixel counts; Ks [V, 3,
+      3] in its pixels;
              poses [V, 4, 4]; z: of each photo, the depths of some points in it.
-    Choices: a pixel counts where AGREE of the other views have its depth, and few see through it; so does what planes
-      add to these.
+    Choices: a pixel counts where AGREE of the other views have its depth, and few see through it;
+      so does what planes add to these.
     """
     from chebsplat.stages.reconstruction.matching import apart
 
-    bounds = np.array([np.percentile(some, (1, 99)) if len(some) else (np.nan, np.nan) for some in z])
+    bounds = np.array(
+        [np.percentile(some, (1, 99)) if len(some) else (np.nan, np.nan) for some in z]
+    )
     near, far = NEAR * bounds[:, 0], FAR * np.nanmax(bounds[:, 1])
     cost = apart(poses)
     nearest = np.where(np.isfinite(np.sort(cost)), np.argsort(cost), -1)
@@ -133,7 +166,11 @@ def depth_of_photos(
     cameras = torch.from_numpy(Ks).float(), torch.from_numpy(poses).float()
     depth = np.zeros(colors.shape[:3], np.float32)
     views = range(len(colors))
-    for view, _ in progress.track(views, len(colors), "depth of photos") if progress else ((v, None) for v in views):
+    for view, _ in (
+        progress.track(views, len(colors), "depth of photos")
+        if progress
+        else ((v, None) for v in views)
+    ):
         neighbors = [int(k) for k in nearest[view, :NEIGHBORS] if k >= 0]
         if np.isfinite(near[view]) and len(neighbors) >= AGREE:
             tried = 1 / torch.linspace(1 / float(near[view]), 1 / float(far), DEPTHS)
@@ -146,50 +183,75 @@ def depth_of_photos(
 
 
 def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[str, Any]:
-    """The means of the points in each cube that holds enough of them (LEAST); seen from where the first of them is.
+    """The means of the points in each cube that holds enough of them (LEAST); seen from where the
+    first of them is.
 
-    Choices: of twice as many cubes as points are wanted, since what lies off the surfaces fills half of them.
+    Choices: of twice as many cubes as points are wanted, since what lies off the surfaces fills
+      half of them.
     """
     if len(means) == 0:
         return {"means": means, "colors": colors, "seen_from": seen_from}
     numbers = cubes_of(means, edge_of(means, 2 * MOST))
     _, first, cube = np.unique(numbers, return_index=True, return_inverse=True)
     is_dense, middle, color = means_of_each(cube, LEAST, means, colors)
-    return {"means": middle, "colors": color.round().astype(np.uint8), "seen_from": seen_from[first[is_dense]]}
+    return {
+        "means": middle,
+        "colors": color.round().astype(np.uint8),
+        "seen_from": seen_from[first[is_dense]],
+    }
 
 
 def facing(poses: np.ndarray) -> float:
-    """The share of pairs of cameras [V, 4, 4] that have one another before them and look more than 90° apart."""
+    """The share of pairs of cameras [V, 4, 4] that have one another before them and look more than
+    90° apart.
+    """
     eyes, forward = centers(poses), poses[:, 2, :3]
     before = np.einsum("ijk,ik->ij", eyes - eyes[:, None], forward) > 0
     return float((before & before.T & (forward @ forward.T < 0)).mean())
 
 
 def backdrop(capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
-    """means, colors and seen_from of points far behind all others, as a cloud has them: one in each cell of a training
-    photo in which no point lies, of that cell's mean colour.
+    """means, colors and seen_from of points far behind all others, as a cloud has them: one in each
+    cell of a training photo in which no point lies, of that cell's mean colour.
 
-    Choices: none unless FACING of the pairs of cameras face one another. What such a cell shows is built otherwise from
-      what lies nearest, which looks right from there, and stands before the cameras on the other side. As deep as
-      BEHIND times the farthest point in any photo (99th percentile).
+    Choices: none unless FACING of the pairs of cameras face one another. What such a cell shows is
+      built otherwise from what lies nearest, which looks right from there, and stands before the
+      cameras on the other side. As deep as BEHIND times the farthest point in any photo (99th
+      percentile).
     """
     row, (width, height) = {name: k for k, name in enumerate(capture.names)}, capture.size
     Ks, poses = cloud["Ks"], cloud["cam_from_world"]
-    used = [k for k, name in enumerate(cloud["names"]) if not capture.is_test[row[name]]] * (facing(poses) > FACING)
+    used = [k for k, name in enumerate(cloud["names"]) if not capture.is_test[row[name]]] * (
+        facing(poses) > FACING
+    )
     depths = [in_photo(Ks[k], poses[k], cloud["means"], capture.size)[:, 2] for k in used]
     far = BEHIND * max((np.percentile(z, 99) for z in depths if len(z)), default=0.0)
     means, colors, seen = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0, np.int64)]
     for k in used:
-        empty, view = ~cells_with(Ks[k], poses[k], cloud["means"], capture.size), row[cloud["names"][k]]
-        small = Image.fromarray(capture.images[view]).resize(empty.shape[::-1], Image.Resampling.BOX)
+        empty, view = (
+            ~cells_with(Ks[k], poses[k], cloud["means"], capture.size),
+            row[cloud["names"][k]],
+        )
+        small = Image.fromarray(capture.images[view]).resize(
+            empty.shape[::-1], Image.Resampling.BOX
+        )
         if capture.loss_mask is not None:
-            counted = Image.fromarray(capture.loss_mask[view]).resize(empty.shape[::-1], Image.Resampling.NEAREST)
+            counted = Image.fromarray(capture.loss_mask[view]).resize(
+                empty.shape[::-1], Image.Resampling.NEAREST
+            )
             empty &= np.asarray(counted)
-        pixels, scale = np.argwhere(empty), np.array([empty.shape[1] / width, empty.shape[0] / height, 1.0])
+        pixels, scale = (
+            np.argwhere(empty),
+            np.array([empty.shape[1] / width, empty.shape[0] / height, 1.0]),
+        )
         means.append(unproject(np.full(empty.shape, far), scale[:, None] * Ks[k], poses[k], pixels))
         colors.append(np.asarray(small)[tuple(pixels.T)])
         seen.append(np.full(len(pixels), k))
-    return {"means": np.concatenate(means), "colors": np.concatenate(colors), "seen_from": np.concatenate(seen)}
+    return {
+        "means": np.concatenate(means),
+        "colors": np.concatenate(colors),
+        "seen_from": np.concatenate(seen),
+    }
 
 
 def reduced(image: np.ndarray, factor: int) -> np.ndarray:

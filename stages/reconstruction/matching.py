@@ -1,7 +1,10 @@
-"""Features of a capture's views and their matches, by pycolmap, in a database that mapping and triangulation read.
+"""Features of a capture's views and their matches, by pycolmap, in a database that mapping and
+triangulation read.
 
-Which views are matched with each other: all, those of near cameras, or those alike. Views are counted 0...V-1 in the
-capture's order, which is that of their names. Pairs are int [P, 2], smaller index first, each once and sorted.
+Which views are matched with each other: all, those of near cameras, or those alike. Views are
+  counted 0...V-1 in the
+capture's order, which is that of their names. Pairs are int [P, 2], smaller index first, each once
+and sorted.
 """
 
 from __future__ import annotations
@@ -24,12 +27,16 @@ from chebsplat.stages.sources.common import file_of
 
 log = logging.getLogger("chebsplat")
 Searched = SfmSection | PoseSection  # settings of features and pairs
-PHOTOS, PAIRS = 8, 64  # a thread's share between two lines of progress; each such block of pairs indexes its views anew
+# a thread's share between two lines of progress; each such block of pairs indexes its views anew
+PHOTOS, PAIRS = 8, 64
 LEAST = 15  # matches of a pair that has any: pycolmap's own, of a free search
 LARGEST = 128  # features of a view, by size, that say how alike two views are
 FEW = 100  # views that are all matched with each other
-TURN = 30.0  # degrees between two viewing directions that weigh like the capture's median distance of two cameras
-APART = 90.0  # degrees; views that face farther from each other share no feature that SIFT could match
+# degrees between two viewing directions that weigh like the capture's median distance of two
+# cameras
+TURN = 30.0
+# degrees; views that face farther from each other share no feature that SIFT could match
+APART = 90.0
 IN_A_ROW = 5  # views on either side in the order of names
 RATIO = 0.8  # Lowe's, of the distances of the nearest and the second nearest descriptor
 
@@ -46,7 +53,10 @@ def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray) -
 
 def with_features(job: Job, capture: Capture, settings: SfmSection, views: Sequence[int]) -> Path:
     """A database of views with SIFT from the capture's own pixels."""
-    folder, database = _write_images(job, capture, views), empty_database(job.scratch / "database.db")
+    folder, database = (
+        _write_images(job, capture, views),
+        empty_database(job.scratch / "database.db"),
+    )
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "PINHOLE"
     if capture.loss_mask is not None:
@@ -61,7 +71,9 @@ def with_features(job: Job, capture: Capture, settings: SfmSection, views: Seque
 
 def empty_database(path: Path) -> Path:
     """A new database in place of what may lie there."""
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
+    pycolmap.logging.minloglevel = (
+        pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     path.unlink(missing_ok=True)
     pycolmap.Database.open(path).close()  # creates it
@@ -77,7 +89,9 @@ def extract(
     mode: pycolmap.CameraMode,
     settings: Searched,
 ) -> None:
-    """Add images of a folder to a database, with their cameras as `reader` and `mode` say, and with their SIFT."""
+    """Add images of a folder to a database, with their cameras as `reader` and `mode` say, and with
+    their SIFT.
+    """
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.peak_threshold = settings.peak_threshold
     extraction.sift.max_num_features = settings.max_features
@@ -88,7 +102,9 @@ def extract(
 
 
 def match_freely(job: Job, database: Path, pairs: np.ndarray, settings: Searched) -> None:
-    """Match pairs of views [P, 2] as if nothing were known of their poses; what RANSAC verifies is kept."""
+    """Match pairs of views [P, 2] as if nothing were known of their poses; what RANSAC verifies is
+    kept.
+    """
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.use_gpu, matching.num_threads = False, n_threads()
     verification.ransac.random_seed = settings.seed
@@ -101,10 +117,11 @@ def match_freely(job: Job, database: Path, pairs: np.ndarray, settings: Searched
 
 
 def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capture) -> None:
-    """Match pairs of views [P, 2] along the epipolar lines that their poses make, which fit the photos.
+    """Match pairs of views [P, 2] along the epipolar lines that their poses make, which fit the
+    photos.
 
-    Choices: a pair of fewer than LEAST matches has none, as in a free search. Features of one block's views are in
-      memory at once.
+    Choices: a pair of fewer than LEAST matches has none, as in a free search. Features of one
+      block's views are in memory at once.
     """
     poses, Ks, n_matches = capture.cam_from_world, capture.Ks, 0
     assert poses is not None
@@ -128,12 +145,17 @@ def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capt
     job.facts["n_matches_along_lines"] = n_matches
 
 
-def chosen_pairs(job: Job, database: Path, n: int, settings: Searched, poses: np.ndarray | None = None) -> np.ndarray:
+def chosen_pairs(
+    job: Job, database: Path, n: int, settings: Searched, poses: np.ndarray | None = None
+) -> np.ndarray:
     """Pairs of `n` views to match, int [P, 2], as `matching` of the settings says."""
     mode = matching_mode(settings.matching, n, poses is not None)
     if mode == "posed":
         assert poses is not None
-        pairs, why = nearest_by_pose(poses, settings.n_matched), f"{settings.n_matched} nearest of each by its pose"
+        pairs, why = (
+            nearest_by_pose(poses, settings.n_matched),
+            (f"{settings.n_matched} nearest of each by its pose"),
+        )
     elif mode == "sequential":
         pairs = in_sequence(_largest_descriptors(database, n), settings.n_matched)
         why = f"{IN_A_ROW} before and after each, {settings.n_matched} most alike"
@@ -152,12 +174,16 @@ def _largest_descriptors(database: Path, n_views: int) -> list[np.ndarray]:
             shape = opened.read_keypoints(image.image_id)[:, 2:]  # affine [n, 4], rows
             largest = np.argsort(-np.hypot(shape[:, 0], shape[:, 2]), kind="stable")[:LARGEST]
             some = opened.read_descriptors(image.image_id).data[largest].astype(np.float32)
-            found[int(image.name[:-4])] = some / np.maximum(np.linalg.norm(some, axis=1, keepdims=True), 1e-9)
+            found[int(image.name[:-4])] = some / np.maximum(
+                np.linalg.norm(some, axis=1, keepdims=True), 1e-9
+            )
     return found
 
 
 def _write_images(job: Job, capture: Capture, views: Iterable[int]) -> Path:
-    """The images of some of the capture's views, and where it has them their masks, as pycolmap reads them."""
+    """The images of some of the capture's views, and where it has them their masks, as pycolmap
+    reads them.
+    """
     folder, masks = job.scratch / "images", job.scratch / "masks"
     folder.mkdir(parents=True, exist_ok=True)
     masks.mkdir(exist_ok=True)
@@ -184,9 +210,11 @@ def _cameras_differ(capture: Capture) -> bool:
 
 
 def matching_mode(wanted: str, n_views: int, posed: bool) -> str:
-    """`exhaustive`, `posed` or `sequential`: the one that is wanted, and for `auto` the one that fits.
+    """`exhaustive`, `posed` or `sequential`: the one that is wanted, and for `auto` the one that
+    fits.
 
-    Choices: given poses choose pairs at any number of views; without poses few views are all matched.
+    Choices: given poses choose pairs at any number of views; without poses few views are all
+      matched.
     """
     if wanted == "auto":
         return "posed" if posed else "exhaustive" if n_views <= FEW else "sequential"
@@ -202,15 +230,17 @@ def nearest_by_pose(cam_from_world: np.ndarray, n_neighbors: int) -> np.ndarray:
     """Each view with the `n_neighbors` that are nearest by position and viewing direction.
 
     Args:    cam_from_world: [V, 4, 4].
-    Choices: distance over the capture's median distance, plus angle over TURN: no depth of the scene is needed. On 50
-      photos with poses (fox) 10 neighbours are a quarter of the pairs and leave 98 % of the points; frusta at guessed
-      depths choose no better.
+    Choices: distance over the capture's median distance, plus angle over TURN: no depth of the
+      scene is needed. On 50 photos with poses (fox) 10 neighbours are a quarter of the pairs and
+      leave 98 % of the points; frusta at guessed depths choose no better.
     """
     return nearest(apart(cam_from_world), n_neighbors)
 
 
 def apart(cam_from_world: np.ndarray) -> np.ndarray:
-    """How far two views lie apart [V, V], in median distances and TURNs; infinite beyond APART and with itself."""
+    """How far two views lie apart [V, V], in median distances and TURNs; infinite beyond APART and
+    with itself.
+    """
     eye, forward = centers(cam_from_world), cam_from_world[:, 2, :3]
     distance = np.linalg.norm(eye[:, None] - eye[None], axis=-1)
     angle = np.degrees(np.arccos(np.clip(forward @ forward.T, -1, 1)))
@@ -221,12 +251,16 @@ def apart(cam_from_world: np.ndarray) -> np.ndarray:
 
 
 def in_sequence(descriptors: list[np.ndarray], n_neighbors: int) -> np.ndarray:
-    """Each view with IN_A_ROW before and after it, and with the `n_neighbors` most alike wherever they are.
+    """Each view with IN_A_ROW before and after it, and with the `n_neighbors` most alike wherever
+    they are.
 
-    Args:    descriptors: per view [k, 128], of its largest features: those are seen from far and near.
-    Choices: being alike is the number of matches between these few (mutual, by Lowe's ratio). That takes milliseconds
-      a pair, needs no vocabulary, closes loops, and finds neighbours where names say nothing about the order. With 128
-      features a view it chooses as well as given poses do: in a quarter of fox's pairs both keep 65 % of all inliers.
+    Args:    descriptors: per view [k, 128], of its largest features: those are seen from far and
+      near.
+    Choices: being alike is the number of matches between these few (mutual, by Lowe's ratio). That
+      takes milliseconds a pair, needs no vocabulary, closes loops, and finds neighbours where names
+      say nothing about the order. With 128
+      features a view it chooses as well as given poses do: in a quarter of fox's pairs both keep 65
+        % of all inliers.
     """
     n = len(descriptors)
     alike = np.zeros((n, n))
@@ -235,11 +269,16 @@ def in_sequence(descriptors: list[np.ndarray], n_neighbors: int) -> np.ndarray:
     row = np.arange(n)
     near = np.abs(row[:, None] - row[None]) <= IN_A_ROW
     in_a_row = np.argwhere(np.triu(near, 1))
-    return np.unique(np.concatenate([in_a_row, nearest(np.where(alike > 0, -alike, np.inf), n_neighbors)]), axis=0)
+    return np.unique(
+        np.concatenate([in_a_row, nearest(np.where(alike > 0, -alike, np.inf), n_neighbors)]),
+        axis=0,
+    )
 
 
 def nearest(cost: np.ndarray, count: int) -> np.ndarray:
-    """Pairs of each view with the `count` of least finite cost [V, V]; a pair counts if either view chooses it."""
+    """Pairs of each view with the `count` of least finite cost [V, V]; a pair counts if either view
+    chooses it.
+    """
     cost = cost.copy()
     np.fill_diagonal(cost, np.inf)
     order = np.argsort(cost, 1, kind="stable")[:, :count]
@@ -249,7 +288,9 @@ def nearest(cost: np.ndarray, count: int) -> np.ndarray:
 
 
 def n_matches(first: np.ndarray, second: np.ndarray) -> int:
-    """Mutual nearest neighbours by Lowe's ratio among descriptors f32 [n, 128] and [m, 128] of unit length."""
+    """Mutual nearest neighbours by Lowe's ratio among descriptors f32 [n, 128] and [m, 128] of unit
+    length.
+    """
     if len(first) < 1 or len(second) < 2:
         return 0
     cosine = first @ second.T

@@ -1,4 +1,6 @@
-"""Whether the poses that a source brings fit its photos: matches against the epipolar lines that the poses make."""
+"""Whether the poses that a source brings fit its photos: matches against the epipolar lines that
+the poses make.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,17 @@ from chebsplat.stages.sources.common import file_of
 log = logging.getLogger("chebsplat")
 
 MISFIT = 0.5  # pixels that the median match may miss its epipolar line by
-OVER_FREE = 2.0  # times what it misses that of the pair's own fundamental matrix by: features may be coarse
+# times what it misses that of the pair's own fundamental matrix by: features may be coarse
+OVER_FREE = 2.0
 SHARED = 30  # verified matches of a pair that counts
 LEAST = 6  # such pairs, without which nothing is said
 PROBED, FEATURES = 16, 2048  # pairs that tell; features of a view, where nothing else needs matches
 
 
 class Fit(NamedTuple):
-    """given, free: median distances in pixels to the epipolar lines of the poses, and of each pair's matches alone."""
+    """given, free: median distances in pixels to the epipolar lines of the poses, and of each
+    pair's matches alone.
+    """
 
     given: float
     free: float
@@ -43,29 +48,42 @@ class Fit(NamedTuple):
         return self.tells and self.given > max(MISFIT, OVER_FREE * self.free)
 
 
-def wants_adjustment(job: Job, capture: Capture, settings: SfmSection, database: Path | None = None) -> bool:
+def wants_adjustment(
+    job: Job, capture: Capture, settings: SfmSection, database: Path | None = None
+) -> bool:
     """Whether the poses of a capture are to be adjusted to its photos, as `sfm.poses` says.
 
     Args:    database: with matches of all views; without it some views are matched.
-    Choices: generated poses are exact, and those that came with tracks were made from these photos; both are kept,
-      untested. Others are kept where too few pairs match to tell.
+    Choices: generated poses are exact, and those that came with tracks were made from these photos;
+      both are kept, untested. Others are kept where too few pairs match to tell.
     """
     if settings.poses != "auto" or capture.cam_from_world is None:
         return settings.poses == "adjusted"
     if _exact(capture) or (capture.tracks is not None and len(capture.tracks)):
         return False
-    return measured(job, capture, probed(job, capture, settings) if database is None else database).misses
+    return measured(
+        job, capture, probed(job, capture, settings) if database is None else database
+    ).misses
 
 
-def wants_lines(job: Job, capture: Capture, settings: SfmSection, database: Path, pairs: np.ndarray) -> bool:
-    """Whether views are matched along the epipolar lines of their poses: where these are known to fit the photos.
+def wants_lines(
+    job: Job, capture: Capture, settings: SfmSection, database: Path, pairs: np.ndarray
+) -> bool:
+    """Whether views are matched along the epipolar lines of their poses: where these are known to
+    fit the photos.
 
-    Args:    database: with features of all views; PROBED of the pairs [P, 2] are matched in it to find that out.
-    Choices: stricter than what asks for adjustment, for it also says no where too few pairs match, and where features
-      are coarse. Generated rooms lost by it (docs/results/photographs.md, "At equal seconds"), and are matched by a
-      free search.
+    Args:    database: with features of all views; PROBED of the pairs [P, 2] are matched in it to
+      find that out.
+    Choices: stricter than what asks for adjustment, for it also says no where too few pairs match,
+      and where features are coarse. Generated rooms lost by it (docs/results/photographs.md, "At
+      equal seconds"), and are matched by a free search.
     """
-    if capture.cam_from_world is None or settings.poses == "adjusted" or _exact(capture) or len(pairs) < LEAST:
+    if (
+        capture.cam_from_world is None
+        or settings.poses == "adjusted"
+        or _exact(capture)
+        or len(pairs) < LEAST
+    ):
         return False
     match_freely(job, database, _some_of(pairs), settings)
     found = measured(job, capture, database)
@@ -86,7 +104,8 @@ def measured(job: Job, capture: Capture, database: Path | None) -> Fit:
     found = Fit(0.0, 0.0, 0) if database is None else fit(database, capture)
     job.facts |= {"epipolar_px": found.given, "epipolar_free_px": found.free}
     log.info(
-        "given poses %s the photos: matches of %d pairs miss their epipolar lines by %.2f px, %.2f where each pair is "
+        "given poses %s the photos: matches of %d pairs miss their epipolar lines by %.2f px, "
+        "%.2f where each pair is "
         "free (medians)%s",
         "do not fit" if found.misses else "fit", found.n_pairs, found.given, found.free,
         "" if found.tells else f"; fewer than {LEAST} pairs match, too few to tell",
@@ -95,7 +114,9 @@ def measured(job: Job, capture: Capture, database: Path | None) -> Fit:
 
 
 def probed(job: Job, capture: Capture, settings: SfmSection) -> Path | None:
-    """A database of PROBED pairs of neighbouring views, evenly chosen, and large features; None without pairs."""
+    """A database of PROBED pairs of neighbouring views, evenly chosen, and large features; None
+    without pairs.
+    """
     assert capture.cam_from_world is not None
     pairs = nearest_by_pose(capture.cam_from_world, settings.n_matched)
     if len(pairs) < LEAST:
@@ -116,12 +137,20 @@ def fit(database: Path, capture: Capture) -> Fit:
             if len(matches) < SHARED or geometry.F is None:
                 continue
             ids = pycolmap.pair_id_to_image_pair(pair)
-            first, second = (opened.read_keypoints(key)[matches[:, side], :2] for side, key in enumerate(ids))
+            first, second = (
+                opened.read_keypoints(key)[matches[:, side], :2] for side, key in enumerate(ids)
+            )
             a, b = (view[key] for key in ids)
-            misses = sampson_distance(fundamental(capture.Ks[a], poses[a], capture.Ks[b], poses[b]), first, second)
+            misses = sampson_distance(
+                fundamental(capture.Ks[a], poses[a], capture.Ks[b], poses[b]), first, second
+            )
             if np.isfinite(misses).all():
                 given.append(misses)
                 free.append(sampson_distance(geometry.F, first, second))
     if not given:
         return Fit(0.0, 0.0, 0)
-    return Fit(float(np.median(np.concatenate(given))), float(np.nanmedian(np.concatenate(free))), len(given))
+    return Fit(
+        float(np.median(np.concatenate(given))),
+        float(np.nanmedian(np.concatenate(free))),
+        len(given),
+    )

@@ -1,6 +1,8 @@
-"""Cameras of photos that come alone: incremental mapping by pycolmap, which calibrates each camera as it maps.
+"""Cameras of photos that come alone: incremental mapping by pycolmap, which calibrates each camera
+as it maps.
 
-What fails with the usual features and lens is tried again with more features, then with a fisheye's lens.
+What fails with the usual features and lens is tried again with more features, then with a fisheye's
+lens.
 """
 
 from __future__ import annotations
@@ -15,7 +17,12 @@ import pycolmap
 
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.reconstruction import judge
-from chebsplat.stages.reconstruction.matching import chosen_pairs, empty_database, extract, match_freely
+from chebsplat.stages.reconstruction.matching import (
+    chosen_pairs,
+    empty_database,
+    extract,
+    match_freely,
+)
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.settings import PoseSection
 from chebsplat.stages.sources.cameras import EQUIRECTANGULAR
@@ -30,19 +37,25 @@ WIDE = 0.5  # a fisheye's focal length in longer sides, where EXIF says nothing
 FILM = 36.0  # mm, the longer side of the frame that 35 mm equivalents refer to
 STRAY = 3.0  # pixels of the pictures that photos are reduced to
 FLATTEST = 1.5  # degrees between the rays of a point: COLMAP's own
-LENSES = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "OPENCV": 4, "OPENCV_FISHEYE": 4}  # and their terms
+# and their terms
+LENSES = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "OPENCV": 4, "OPENCV_FISHEYE": 4}
 
 
-def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection) -> PhotoModel | None:
-    """The model of photos whose reduced pictures lie in a folder, named by their rows; None where no two register.
+def found(
+    job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection
+) -> PhotoModel | None:
+    """The model of photos whose reduced pictures lie in a folder, named by their rows; None where
+    no two register.
 
-    Choices: attempts end once none could register MORE times the photos of the best; a costlier one replaces it only
-      with so many that are undisputed, for faint features also match what only looks alike. Mapping runs on one
-      thread, to be repeatable.
+    Choices: attempts end once none could register MORE times the photos of the best; a costlier one
+      replaces it only with so many that are undisputed, for faint features also match what only
+      looks alike. Mapping runs on one thread, to be repeatable.
     """
 
     def mapped(lens: str, peak: float) -> PhotoModel | None:
-        database = _matched(job, shots, pictures, lens, settings.model_copy(update={"peak_threshold": peak}))
+        database = _matched(
+            job, shots, pictures, lens, settings.model_copy(update={"peak_threshold": peak})
+        )
         return _mapped(job, shots, pictures, database, settings.seed)
 
     lens: str = settings.camera
@@ -53,7 +66,13 @@ def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection
         n_registered = 0 if best is None else len(best.names)
         if n_registered * MORE >= len(shots):
             break
-        log.info("%d of %d photos registered; trying %s, features from %g on", n_registered, len(shots), other, peak)
+        log.info(
+            "%d of %d photos registered; trying %s, features from %g on",
+            n_registered,
+            len(shots),
+            other,
+            peak,
+        )
         tried = mapped(other, peak)
         undisputed = 0 if best is None else best.judged["n_undisputed"]
         if tried is not None and tried.judged["n_undisputed"] > MORE * undisputed:
@@ -62,19 +81,21 @@ def found(job: Job, shots: Sequence[Shot], pictures: Path, settings: PoseSection
 
 
 def further(lens: str, settings: PoseSection, registered: float) -> list[tuple[str, float]]:
-    """(camera model, peak threshold of SIFT) to try after `lens` has registered such a part of the photos: more
-    features, and first a fisheye's lens where it is less than HALF.
+    """(camera model, peak threshold of SIFT) to try after `lens` has registered such a part of the
+    photos: more features, and first a fisheye's lens where it is less than HALF.
     """
     faint = min(settings.peak_threshold, FAINT)
     fisheye = settings.camera == "auto" and lens != EQUIRECTANGULAR and registered < HALF
     return [(FISHEYE, faint)] * fisheye + [(lens, faint)] * (faint < settings.peak_threshold)
 
 
-def _matched(job: Job, shots: Sequence[Shot], pictures: Path, lens: str, settings: PoseSection) -> Path:
+def _matched(
+    job: Job, shots: Sequence[Shot], pictures: Path, lens: str, settings: PoseSection
+) -> Path:
     """A database of the photos' features and matches.
 
-    Choices: photos of one size and focal length have one camera. Where EXIF tells no focal length there is none before
-      mapping, but for a fisheye's, which is not found without.
+    Choices: photos of one size and focal length have one camera. Where EXIF tells no focal length
+      there is none before mapping, but for a fisheye's, which is not found without.
     """
     database = empty_database(job.scratch / "database.db")
     alike: dict[tuple[tuple[int, int], float | None, bool], list[int]] = {}
@@ -91,7 +112,9 @@ def _matched(job: Job, shots: Sequence[Shot], pictures: Path, lens: str, setting
         elif focal is not None or lens == FISHEYE:
             pixels = max(width, height) * (WIDE if focal is None else focal / FILM)
             focals = [pixels] * (2 if lens.startswith("OPENCV") else 1)
-            reader.camera_params = ",".join(map(str, [*focals, width / 2, height / 2, *[0.0] * LENSES[lens]]))
+            reader.camera_params = ",".join(
+                map(str, [*focals, width / 2, height / 2, *[0.0] * LENSES[lens]])
+            )
         if any(shot.mask for shot in shots):
             reader.mask_path = str(pictures / "masks")
         files = [file_of(row) for row in rows]
@@ -100,7 +123,9 @@ def _matched(job: Job, shots: Sequence[Shot], pictures: Path, lens: str, setting
     return database
 
 
-def _mapped(job: Job, shots: Sequence[Shot], pictures: Path, database: Path, seed: int) -> PhotoModel | None:
+def _mapped(
+    job: Job, shots: Sequence[Shot], pictures: Path, database: Path, seed: int
+) -> PhotoModel | None:
     """The largest model that mapping finds, in pixels of the photos; None where there is none."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, seed
@@ -125,29 +150,36 @@ def _mapped(job: Job, shots: Sequence[Shot], pictures: Path, database: Path, see
         model.deregister_frame(model.images[identity].frame_id)
     mapped_error = model.compute_mean_reprojection_error()
     _refine(model)
-    judged = judge.judged(model, judge.pairs(model, database), len(shots), sizes[1:], len(misplaced), mapped_error)
+    judged = judge.judged(
+        model, judge.pairs(model, database), len(shots), sizes[1:], len(misplaced), mapped_error
+    )
     return _collected(model, shots, judged)
 
 
 def _refine(model: pycolmap.Reconstruction) -> None:
-    """Adjust a model's cameras, poses and points once more, without the observations that miss by much.
+    """Adjust a model's cameras, poses and points once more, without the observations that miss by
+    much.
 
-    Choices: under a Cauchy loss of one pixel, then without those that miss by more than STRAY, and again. Of views of
-      a modelled house, whose poses are known, it takes a third of the turns' error (.43 to .30°) and a tenth of the
-      places' (1.9 to 1.7 cm); a lens of more terms takes nothing.
+    Choices: under a Cauchy loss of one pixel, then without those that miss by more than STRAY, and
+      again. Of views of a modelled house, whose poses are known, it takes a third of the turns'
+      error (.43 to .30°) and a tenth of the places' (1.9 to 1.7 cm); a lens of more terms takes
+      nothing.
     """
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.function_tolerance = 1e-5  # of 0 it takes five times as long for the same cameras
+    # of 0 it takes five times as long for the same cameras
+    options.ceres.solver_options.function_tolerance = 1e-5
     for _ in range(2):
         pycolmap.bundle_adjustment(model, options)
         pycolmap.ObservationManager(model).filter_all_points3D(STRAY, FLATTEST)
     model.update_point_3d_errors()
 
 
-def _collected(model: pycolmap.Reconstruction, shots: Sequence[Shot], judged: dict[str, Any]) -> PhotoModel:
+def _collected(
+    model: pycolmap.Reconstruction, shots: Sequence[Shot], judged: dict[str, Any]
+) -> PhotoModel:
     """The arrays of a model, its cameras in pixels of the photos as they are."""
     images = sorted((i for i in model.images.values() if i.has_pose), key=lambda image: image.name)
     rows = [int(image.name[:-4]) for image in images]
@@ -155,14 +187,24 @@ def _collected(model: pycolmap.Reconstruction, shots: Sequence[Shot], judged: di
     place = {image.image_id: view for view, image in enumerate(images)}
     cameras: list[list[Any]] = []
     for identity in used:
-        held, width, height = model.cameras[identity], *shots[rows[[i.camera_id for i in images].index(identity)]].size
+        held, width, height = (
+            model.cameras[identity],
+            *shots[rows[[i.camera_id for i in images].index(identity)]].size,
+        )
         held.rescale(width, height)
         cameras.append([held.model.name, [float(value) for value in held.params], width, height])
     points: list[Any] = [model.points3D[key] for key in sorted(model.points3D)]
-    tracks = [(k, place[e.image_id]) for k, p in enumerate(points) for e in p.track.elements if e.image_id in place]
+    tracks = [
+        (k, place[e.image_id])
+        for k, p in enumerate(points)
+        for e in p.track.elements
+        if e.image_id in place
+    ]
     poses = np.tile(np.eye(4), (len(images), 1, 1))
     poses[:, :3] = [image.cam_from_world().matrix() for image in images]
-    lenses = ", ".join(f"{name} {[round(value, 4) for value in params]}" for name, params, *_ in cameras[:3])
+    lenses = ", ".join(
+        f"{name} {[round(value, 4) for value in params]}" for name, params, *_ in cameras[:3]
+    )
     return PhotoModel(
         [shots[row].name for row in rows],
         cameras,
@@ -173,6 +215,9 @@ def _collected(model: pycolmap.Reconstruction, shots: Sequence[Shot], judged: di
         np.array([point.error for point in points]),
         np.array(sorted(set(tracks)), np.int32).reshape(-1, 2),
         [shots[row].frame for row in rows],
-        [judge.sentence(judged), f"{len(cameras)} camera{'s' if len(cameras) > 1 else ''} in pixels: {lenses}."],
+        [
+            judge.sentence(judged),
+            f"{len(cameras)} camera{'s' if len(cameras) > 1 else ''} in pixels: {lenses}.",
+        ],
         judged,
     )

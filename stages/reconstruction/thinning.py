@@ -1,4 +1,6 @@
-"""Fewer points: one a cube, of cubes all alike, or the smaller the more the colours within them differ."""
+"""Fewer points: one a cube, of cubes all alike, or the smaller the more the colours within them
+differ.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +14,22 @@ if TYPE_CHECKING:
     from chebsplat.formats.points import Points
 
 LEVELS = 4  # sizes of cubes that colours choose among, each half of the one before
-NOISE = 1e-3  # what colours of one surface differ by: squared, of channels in [0, 1], summed over the three
+# what colours of one surface differ by: squared, of channels in [0, 1], summed over the three
+NOISE = 1e-3
 
 
 def thin(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of at most `count` points, the first in each cube of the smallest edge that allows it."""
+    """Indices of at most `count` points, the first in each cube of the smallest edge that allows
+    it.
+    """
     if len(points) <= count:
         return np.arange(len(points))
     return first_of_each(points, edge_of(points, count))
 
 
 def even(points: Points) -> np.ndarray:
-    """Indices of points that lie as far apart wherever they are: of those that are closer where colours change, the
-    first in each of the largest cubes; all others.
+    """Indices of points that lie as far apart wherever they are: of those that are closer where
+    colours change, the first in each of the largest cubes; all others.
     """
     if "largest" not in points.notes:
         return np.arange(len(points.means))
@@ -37,26 +42,34 @@ def edge_of(points: np.ndarray, count: int) -> float:
     low, high = size / 4096, size
     for _ in range(24):
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if len(np.unique(cubes_of(points, middle))) > count else (low, middle)
+        low, high = (
+            (middle, high) if len(np.unique(cubes_of(points, middle))) > count else (low, middle)
+        )
     return high
 
 
-def by_color(points: np.ndarray, colors: np.ndarray, count: int, edge: float) -> tuple[np.ndarray, np.ndarray]:
-    """At most `count` cubes that hold points [N, 3], the smaller the more the colours u8 [N, 3] within them differ: the
-    first point of each, in order, and the cube of every point [N].
+def by_color(
+    points: np.ndarray, colors: np.ndarray, count: int, edge: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """At most `count` cubes that hold points [N, 3], the smaller the more the colours u8 [N, 3]
+    within them differ: the first point of each, in order, and the cube of every point [N].
 
     Args: edge: of the largest cubes, which are not more than `count`.
 
-    Choices: cubes are halved while the squares by which their points' colours differ from their mean, and NOISE for
-      each point, sum to more than a bound, the least that keeps to `count`. Where pixels have given the points, that
-      sum is the error of pictures in which each cube has one colour.
+    Choices: cubes are halved while the squares by which their points' colours differ from their
+      mean, and NOISE for each point, sum to more than a bound, the least that keeps to `count`.
+      Where pixels have given the points, that sum is the error of pictures in which each cube has
+      one colour.
     """
     values = colors / 255.0
     cube_of: list[np.ndarray] = []
     errors, parents, firsts = [], [], []
     for level in range(LEVELS):
         _, first, cube, held = np.unique(
-            cubes_of(points, edge / 2**level), return_index=True, return_inverse=True, return_counts=True
+            cubes_of(points, edge / 2**level),
+            return_index=True,
+            return_inverse=True,
+            return_counts=True,
         )
         sums = np.stack([np.bincount(cube, values[:, k]) for k in range(3)])
         squares = np.bincount(cube, (values**2).sum(1))
@@ -78,7 +91,9 @@ def by_color(points: np.ndarray, colors: np.ndarray, count: int, edge: float) ->
     low, high = 0.0, max(float(error.max()) for error in errors)
     for _ in range(40):
         middle = (low + high) / 2
-        low, high = (middle, high) if sum(level.sum() for level in whole(middle)) > count else (low, middle)
+        low, high = (
+            (middle, high) if sum(level.sum() for level in whole(middle)) > count else (low, middle)
+        )
     chosen = np.empty(len(points), np.int64)  # of each point, the first one in its cube
     for cube, first, stays in zip(cube_of, firsts, whole(high), strict=True):
         inside = stays[cube]

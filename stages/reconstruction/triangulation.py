@@ -1,4 +1,6 @@
-"""Triangulation by pycolmap: points of views whose poses are given, and adjusted where they miss the photos."""
+"""Triangulation by pycolmap: points of views whose poses are given, and adjusted where they miss
+the photos.
+"""
 
 from __future__ import annotations
 
@@ -21,18 +23,23 @@ from chebsplat.stages.sources.common import file_of
 log = logging.getLogger("chebsplat")
 
 
-def reconstruct(job: Job, capture: Capture, settings: SfmSection, adjusted: bool | None = None) -> dict[str, Any]:
+def reconstruct(
+    job: Job, capture: Capture, settings: SfmSection, adjusted: bool | None = None
+) -> dict[str, Any]:
     """Match views, then triangulate their points.
 
     Args:    adjusted: whether given poses are adjusted to the photos; None: as the matches say.
     Returns: names, Ks, cam_from_world; means, colors, seen_from, tracks; notes.
     Raises:  ConfigError where the capture has no poses.
-    Choices: images are imported in the order of their names before extraction, which makes extraction, matching and
-      triangulation reproducible. Test views take part in posing, never in colouring. Where given poses fit the photos,
-      matches are looked for along epipolar lines alone.
+    Choices: images are imported in the order of their names before extraction, which makes
+      extraction, matching and triangulation reproducible. Test views take part in posing, never in
+      colouring. Where given poses fit the photos, matches are looked for along epipolar lines
+      alone.
     """
     if capture.cam_from_world is None:
-        raise ConfigError("the capture has no poses; give the artifact of stage pose to ingest (--in-model)")
+        raise ConfigError(
+            "the capture has no poses; give the artifact of stage pose to ingest (--in-model)"
+        )
     n = len(capture.names)
     database = matching.with_features(job, capture, settings, range(n))
     pairs = matching.chosen_pairs(job, database, n, settings, capture.cam_from_world)
@@ -44,7 +51,9 @@ def reconstruct(job: Job, capture: Capture, settings: SfmSection, adjusted: bool
     model = _triangulate(job, capture, database)
     moved: dict[str, Any] = {}
     if wants_adjustment(job, capture, settings, database) if adjusted is None else adjusted:
-        model, moved = adjust(job, model, database, [file_of(view) for view in range(n)], capture.cam_from_world)
+        model, moved = adjust(
+            job, model, database, [file_of(view) for view in range(n)], capture.cam_from_world
+        )
     else:
         job.left_out("pose estimation", "poses are given: points are triangulated")
     images = {image.name: image for image in model.images.values()}
@@ -72,7 +81,9 @@ def _triangulate(job: Job, capture: Capture, database: Path) -> pycolmap.Reconst
         view = int(image.name[:-4])
         K = capture.Ks[view]
         params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-        camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params, camera_id=image.camera_id)
+        camera = pycolmap.Camera(
+            model="PINHOLE", width=width, height=height, params=params, camera_id=image.camera_id
+        )
         if not model.exists_camera(image.camera_id):
             model.add_camera_with_trivial_rig(camera)
         pose = pycolmap.Rigid3d(capture.cam_from_world[view][:3])
@@ -87,11 +98,16 @@ def _triangulate(job: Job, capture: Capture, database: Path) -> pycolmap.Reconst
 
 
 def _collect(
-    model: pycolmap.Reconstruction, capture: Capture, images: list[pycolmap.Image], settings: SfmSection
+    model: pycolmap.Reconstruction,
+    capture: Capture,
+    images: list[pycolmap.Image],
+    settings: SfmSection,
 ) -> dict[str, Any]:
-    """Arrays of the model: cameras, points with a training view that sees them, colours from such views.
+    """Arrays of the model: cameras, points with a training view that sees them, colours from such
+    views.
 
-    Choices: points with a reprojection error above 4 px or seen only by test views are dropped; of too many, those
+    Choices: points with a reprojection error above 4 px or seen only by test views are dropped; of
+      too many, those
     with the longest tracks stay.
     """
     row = {image.image_id: index for index, image in enumerate(images)}
@@ -101,7 +117,11 @@ def _collect(
     entries = []
     for identity in sorted(model.points3D):
         point = model.points3D[identity]
-        elements = [(row[e.image_id], e.point2D_idx, e.image_id) for e in point.track.elements if e.image_id in row]
+        elements = [
+            (row[e.image_id], e.point2D_idx, e.image_id)
+            for e in point.track.elements
+            if e.image_id in row
+        ]
         training = [e for e in elements if not capture.is_test[e[0]]]
         if training and point.error <= 4:
             entries.append((point.xyz, elements, training[0]))

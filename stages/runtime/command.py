@@ -1,4 +1,6 @@
-"""From `run(job)` to an artifact: inputs checked, one artifact published; and to a command with exit codes."""
+"""From `run(job)` to an artifact: inputs checked, one artifact published; and to a command with
+exit codes.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +32,9 @@ log = logging.getLogger("chebsplat")
 class Job:
     """All that a stage may touch.
 
-    `out` is the directory to fill; it becomes the artifact when `run` returns. `scratch` survives a kill, for
-    stages that resume, and tell `watch` so. `facts` end up in the manifest: what was found, chosen, and left out and
-    why.
+    `out` is the directory to fill; it becomes the artifact when `run` returns. `scratch` survives a
+    kill, for stages that resume, and tell `watch` so. `facts` end up in the manifest: what was
+    found, chosen, and left out and why.
     """
 
     inputs: dict[str, Path]
@@ -51,7 +53,9 @@ class Job:
 
 
 def command(name: str, run: Callable[[Job], None]) -> click.Command:
-    """The click command of stage `name`: explicit inputs, one config, one output, whose path it prints."""
+    """The click command of stage `name`: explicit inputs, one config, one output, whose path it
+    prints.
+    """
     stage = STAGES[name]
 
     def invoke(out: Path, **options: Any) -> None:
@@ -76,18 +80,24 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
         for role, of in (*stage.inputs, *stage.optional)
     ]
     params += [
-        click.Option(["--config"], type=click.Path(path_type=Path), help="TOML or JSON; defaults otherwise"),
-        click.Option(["--out"], type=click.Path(path_type=Path), required=True, help="the artifact's directory"),
+        click.Option(["--config"], type=click.Path(path_type=Path), help="TOML or JSON; defaults "
+                                                                         "otherwise"),
+        click.Option(["--out"], type=click.Path(path_type=Path), required=True, help="the artifact's "
+                                                                                     ""
+                                                                                     ""
+                                                                                     "directory"),
         click.Option(["--device"], type=click.Choice(DEVICES), default="auto", show_default=True),
-        click.Option(["--force"], is_flag=True, help="run even if the artifact exists, and replace it; nothing else"),
+        click.Option(["--force"], is_flag=True, help="run even if the artifact exists, and "
+                                                     "replace it; nothing else"),
     ]  # fmt: skip
     return click.Command(name, params=params, callback=invoke, help=stage.help)
 
 
 @dataclass
 class Planned:
-    """The planner's part of a step: its key (None: of settings and inputs alone), the identity of its code, and
-    what it reads and computes within, which at its end can keep the artifact from being published.
+    """The planner's part of a step: its key (None: of settings and inputs alone), the identity of
+    its code, and what it reads and computes within, which at its end can keep the artifact from
+    being published.
     """
 
     key: str | None = None
@@ -106,13 +116,17 @@ def publish(
     device: str = "auto",
     force: bool = False,
 ) -> None:
-    """Run one stage in this process and publish its artifact; nothing if it is there, unless by `force`.
+    """Run one stage in this process and publish its artifact; nothing if it is there, unless by
+    `force`.
 
-    Args: inputs: artifacts by role; config: TOML or JSON, otherwise defaults; planned: by the planner, if it asks.
+    Args: inputs: artifacts by role; config: TOML or JSON, otherwise defaults; planned: by the
+      planner, if it asks.
     Raises: ChebsplatError.
     """
     line = f"%(asctime)s {name}: %(message)s"
-    logging.basicConfig(stream=sys.stderr, format=line, datefmt="%H:%M:%S", level="WARNING", force=True)
+    logging.basicConfig(
+        stream=sys.stderr, format=line, datefmt="%H:%M:%S", level="WARNING", force=True
+    )
     log.setLevel("INFO")
     out, stage = out.absolute(), STAGES[name]
     if not force and artifact.is_whole(out, stage.schema):
@@ -128,13 +142,25 @@ def publish(
     device = stage.device(device, settings)
     computed = {} if device == "cpu" else {"device": device}
     planned = planned or Planned()
-    key = planned.key or artifact.digest({"stage": name, "config": settings, "inputs": sources} | computed)
+    key = planned.key or artifact.digest(
+        {"stage": name, "config": settings, "inputs": sources} | computed
+    )
     artifact.check_place(out, stage.schema, key, force)
-    seed = next((settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None)
+    seed = next(
+        (settings[s]["seed"] for s in reversed(stage.sections) if "seed" in settings[s]), None
+    )
     if why:
         log.info("%s", why)
     manifest = Manifest(
-        stage.schema, key, name, sources, settings, seed, device=device, threads=n_threads(), code=planned.code
+        stage.schema,
+        key,
+        name,
+        sources,
+        settings,
+        seed,
+        device=device,
+        threads=n_threads(),
+        code=planned.code,
     )
     scratch, watch = out.parent / f".part-{out.name}", Stopwatch(n_threads(), name_of(device))
     with artifact.publish(out, manifest, force) as tmp, planned.within:
@@ -146,7 +172,9 @@ def publish(
         manifest.versions = _versions()
     artifact.discard(scratch)
     if (jit := sys.modules.get("chebsplat.kernels.jit")) and jit.compilation.kernels:
-        log.info("compiled %d kernels in %.0f s, once", jit.compilation.kernels, jit.compilation.seconds)
+        log.info(
+            "compiled %d kernels in %.0f s, once", jit.compilation.kernels, jit.compilation.seconds
+        )
     log.info("done in %.1f s", manifest.seconds)
 
 
@@ -162,4 +190,6 @@ def _versions() -> dict[str, str]:
              "fpsample", "PIL", "safetensors", "plyfile", "matplotlib", "av", "pillow_heif", "gsplat")  # fmt: skip
     distributions = {"open3d": "open3d-cpu", "PIL": "pillow"}
     loaded = sorted(name for name in names if sys.modules.get(name))
-    return {n: metadata.version(distributions.get(n, n)) for n in loaded} | {"python": sys.version.split()[0]}
+    return {n: metadata.version(distributions.get(n, n)) for n in loaded} | {
+        "python": sys.version.split()[0]
+    }

@@ -53,24 +53,34 @@ class Config(Section):
 
 
 def load(path: Path) -> Config:
-    """A config from a TOML or JSON file; sections that are not given keep their defaults. Raises ConfigError."""
+    """A config from a TOML or JSON file; sections that are not given keep their defaults. Raises
+    ConfigError.
+    """
     parse = parse_json if Path(path).suffix == ".json" else parse_toml
     return build(parse(path, "correct it, or pass another --config", ConfigError), str(path))
 
 
 def build(values: dict[str, Any], origin: str) -> Config:
-    """A checked config. Raises ConfigError naming the first bad key, with the nearest known name."""
+    """A checked config. Raises ConfigError naming the first bad key, with the nearest known
+    name.
+    """
     return checked(Config, values, origin)
 
 
-def checked(model: type[Model], values: Any, origin: str, error: type[ChebsplatError] = ConfigError) -> Model:
-    """A model of pydantic's from values that somebody wrote. Raises `error`: one line about the first bad key."""
+def checked(
+    model: type[Model], values: Any, origin: str, error: type[ChebsplatError] = ConfigError
+) -> Model:
+    """A model of pydantic's from values that somebody wrote. Raises `error`: one line about the
+    first bad key.
+    """
     try:
         return model.model_validate(values)
     except ValidationError as faults:
         fault = faults.errors()[0]
         where = ".".join(_shown(part) for part in fault["loc"])
-        raise error(f"{origin}: {where}{': ' if where else ''}{_advice(fault, list(model.model_fields))}") from None
+        raise error(
+            f"{origin}: {where}{': ' if where else ''}{_advice(fault, list(model.model_fields))}"
+        ) from None
 
 
 def known_keys() -> list[str]:
@@ -89,13 +99,21 @@ def _advice(error: Any, first: list[str]) -> str:
     if error["type"] != "extra_forbidden":
         needed = WORDS.get(error["type"]) or error["msg"].replace("Input should be", "it must be")
         held = error["input"]
-        got = f"a {type(held).__name__}" if isinstance(held, (dict, list, tuple)) else f"{held!r:.60}"
+        got = (
+            f"a {type(held).__name__}" if isinstance(held, (dict, list, tuple)) else f"{held!r:.60}"
+        )
         return f"{needed} (got {got})"
     loc = [str(part) for part in error["loc"]]
     if len(loc) == 1:
         near = suggest(loc[0], first, 1)
-        if not near and isinstance(error["input"], dict):  # a section of another name, perhaps an earlier one
-            near = [key for wanted in error["input"] for key in known_keys() if key.endswith(f".{wanted}")]
+        # a section of another name, perhaps an earlier one
+        if not near and isinstance(error["input"], dict):
+            near = [
+                key
+                for wanted in error["input"]
+                for key in known_keys()
+                if key.endswith(f".{wanted}")
+            ]
     else:
         elsewhere = [key for key in known_keys() if key.endswith("." + loc[-1])]
         own = [key.split(".")[1] for key in known_keys() if key.startswith(loc[0] + ".")]

@@ -12,10 +12,12 @@ REMEDY = "`make setup device=cuda` adds it"
 
 
 def resolve(wanted: str) -> tuple[str, str]:
-    """What computes, `cpu` or `cuda`, and why it is not the GPU of a machine that has one ("": nothing is to be said).
+    """What computes, `cpu` or `cuda`, and why it is not the GPU of a machine that has one ("":
+    nothing is to be said).
 
     Raises: ConfigError, with the remedy, on `cuda` where something is missing.
-    Choices: `auto` loads no torch to ask it on a machine without an NVIDIA driver; `cuda` asks it in any case.
+    Choices: `auto` loads no torch to ask it on a machine without an NVIDIA driver; `cuda` asks it
+      in any case.
     """
     if wanted == "cpu" or (wanted == "auto" and not DRIVER.exists()):
         return "cpu", ""
@@ -37,13 +39,19 @@ def name_of(device: str) -> str:
 
 
 def missing() -> str:
-    """What a GPU lacks here to train on it, and what adds it: CUDA in torch, an answer, or gsplat; "": nothing."""
+    """What a GPU lacks here to train on it, and what adds it: CUDA in torch, an answer, or gsplat;
+    "": nothing.
+    """
     import torch
 
     if torch.version.cuda is None:
         return f"torch {torch.__version__} is built without CUDA ({REMEDY})"
     if not torch.cuda.is_available():
-        return "no GPU answers (`nvidia-smi` says more; the driver must know CUDA " + torch.version.cuda + ")"
+        return (
+            "no GPU answers (`nvidia-smi` says more; the driver must know CUDA "
+            + torch.version.cuda
+            + ")"
+        )
     try:
         import gsplat  # noqa: F401
     except ImportError as error:

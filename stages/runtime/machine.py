@@ -1,4 +1,6 @@
-"""What seconds were measured on, of every process that worked on an artifact: processor, cores, threads, load."""
+"""What seconds were measured on, of every process that worked on an artifact: processor, cores,
+threads, load.
+"""
 
 from __future__ import annotations
 
@@ -60,8 +62,15 @@ class Stopwatch:
         self.load = load()
 
     def processes(self) -> list[dict[str, Any]]:
-        """Of each process, in their order: processor, gpu, cores, threads, load at start and now, seconds."""
-        of_machine = {"processor": processor(), "gpu": self.gpu, "cores": cores(), "threads": self.threads}
+        """Of each process, in their order: processor, gpu, cores, threads, load at start and now,
+        seconds.
+        """
+        of_machine = {
+            "processor": processor(),
+            "gpu": self.gpu,
+            "cores": cores(),
+            "threads": self.threads,
+        }
         seconds = round(time.perf_counter() - self.began, 3)
         return [*self.earlier, of_machine | {"load": [self.load, load()], "seconds": seconds}]
 
@@ -73,5 +82,6 @@ class Stopwatch:
         """Count the processes that have made what is kept there, too."""
         try:
             self.earlier = parse_json(scratch / KEPT)
-        except InputError as error:  # a power cut may have spoiled it; what was kept is worth more than its seconds
+        # a power cut may have spoiled it; what was kept is worth more than its seconds
+        except InputError as error:
             log.warning("seconds of what was done before are not counted: %s", error)

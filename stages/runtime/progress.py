@@ -1,4 +1,6 @@
-"""Progress of long work: a bar with rate and ETA on a terminal, plain lines elsewhere, `log.jsonl` always."""
+"""Progress of long work: a bar with rate and ETA on a terminal, plain lines elsewhere, `log.jsonl`
+always.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +39,8 @@ class Progress:
             self._log.write(json.dumps(values) + "\n")
 
     def ticker(self, total: int, what: str) -> Callable[[], None]:
-        """A function to call after each of `total` things that a library counts, not a loop of ours; further calls
-        than that show nothing.
+        """A function to call after each of `total` things that a library counts, not a loop of
+        ours; further calls than that show nothing.
         """
         steps = self.track(range(total), total, what)
         next(steps, None)
@@ -53,11 +55,13 @@ class Progress:
     ) -> Iterator[tuple[T, dict[str, Any]]]:
         """Yield (item, status); what the caller puts into `status` is shown beside rate and ETA.
 
-        total: how many there will be, `start` of them done before; a function where that is only found out on the way.
+        total: how many there will be, `start` of them done before; a function where that is only
+          found out on the way.
         """
         status: dict[str, Any] = {}
         began = last = time.perf_counter()
-        for done, item in enumerate(items):  # the first item warms up and is not counted in the rate
+        # the first item warms up and is not counted in the rate
+        for done, item in enumerate(items):
             yield item, status
             now = time.perf_counter()
             if done == 0:

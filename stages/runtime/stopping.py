@@ -1,8 +1,8 @@
 """Ends of our processes: well, with a typed error, a crash, or by SIGINT, SIGTERM or SIGHUP.
 
-A signal raises `Stopped` in the main thread, so that nothing half made is left; a loop that can reach
-a better place within a moment defers it. Whoever cannot listen (a kernel is being compiled) is killed
-by its run.
+A signal raises `Stopped` in the main thread, so that nothing half made is left; a loop that can
+reach a better place within a moment defers it. Whoever cannot listen (a kernel is being compiled)
+is killed by its run.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def exit_code(
 ) -> int:
     """The door that all commands leave by: the action's code (None: 0), or that of what ends it.
 
-    Args: folder: of a disk's error that names no file; tell: says a typed error or a stop; raised: errors that are left
-      to the caller, beside click's own.
+    Args: folder: of a disk's error that names no file; tell: says a typed error or a stop; raised:
+      errors that are left to the caller, beside click's own.
     """
     try:
         with heeded(), explained(folder):
@@ -58,8 +58,8 @@ def exit_code(
 
 
 class _Output:
-    """Standard output whose refusals name it. The first is kept in `refusal`, since click tries streams in silence;
-    what comes after it is dropped.
+    """Standard output whose refusals name it. The first is kept in `refusal`, since click tries
+    streams in silence; what comes after it is dropped.
     """
 
     def __init__(self, stream: TextIO):
@@ -91,8 +91,9 @@ class _Output:
 
 @contextmanager
 def streams(tell: Callable[[str], object]) -> Iterator[None]:
-    """Standard streams as a command needs them: closed ones lead nowhere, and not into the next file that is opened;
-    an output that takes nothing is a DiskFailure that names it. Raises SystemExit.
+    """Standard streams as a command needs them: closed ones lead nowhere, and not into the next
+    file that is opened; an output that takes nothing is a DiskFailure that names it. Raises
+    SystemExit.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) <= STREAMS:
         os.set_inheritable(number, True)
@@ -117,7 +118,9 @@ def streams(tell: Callable[[str], object]) -> Iterator[None]:
 
 
 class Asked:
-    """What this process has been asked. `stop`: not at all, or what is raised; `since`: by the monotonic clock."""
+    """What this process has been asked. `stop`: not at all, or what is raised; `since`: by the
+    monotonic clock.
+    """
 
     def __init__(self) -> None:
         self.stop: Stopped | None = None
@@ -125,12 +128,15 @@ class Asked:
         self.deferred = False
 
     def heed(self, number: int, _frame: FrameType | None) -> None:
-        """Handle a signal. Within PATIENCE of one a second does not break into the cleaning up after it; later it
-        does, since a destructor may have lost the first.
+        """Handle a signal. Within PATIENCE of one a second does not break into the cleaning up
+        after it; later it does, since a destructor may have lost the first.
         """
         now = time.monotonic()
         if self.stop is None or now - self.since > PATIENCE:
-            self.stop, self.since = Stopped(number, f"stopped by {signal.Signals(number).name}; {KEPT}"), now
+            self.stop, self.since = (
+                Stopped(number, f"stopped by {signal.Signals(number).name}; {KEPT}"),
+                now,
+            )
             if not self.deferred:
                 raise self.stop
 
@@ -174,7 +180,9 @@ def heeded() -> Iterator[None]:
 
 @contextmanager
 def deferred() -> Iterator[Asked]:
-    """Nothing is raised within, but at the end: the block looks at `stop` itself, and comes to one within a moment."""
+    """Nothing is raised within, but at the end: the block looks at `stop` itself, and comes to one
+    within a moment.
+    """
     asked = _asked or Asked()
     asked.deferred = True
     try:

@@ -1,4 +1,6 @@
-"""From what knowledge says of points to a scene's channels, and from what a teacher says to those of knowledge."""
+"""From what knowledge says of points to a scene's channels, and from what a teacher says to those
+of knowledge.
+"""
 
 from __future__ import annotations
 
@@ -17,35 +19,50 @@ from chebsplat.shape.point_inputs import PointInputs
 from chebsplat.stages.teacher_models.text_encoder import found
 
 TEMPERATURE = 0.05  # of cosines between answers and words, chosen on office0, shuffled0 and room0
-SEEN = ("n_angles", "max_degree", "anisotropy", "bandwidth")  # settings of descriptors that an encoder depends on
+# settings of descriptors that an encoder depends on
+SEEN = ("n_angles", "max_degree", "anisotropy", "bandwidth")
 
 
 def inputs_of(path: Path, descriptors: Descriptors, knowledge: Knowledge) -> PointInputs:
     """What the encoder of `knowledge`, which was read from `path`, sees of a scene.
 
-    Raises: DataFailure where the scene shows no surface, or was described with other settings than it was taught with.
+    Raises: DataFailure where the scene shows no surface, or was described with other settings than
+      it was taught with.
     """
     if not len(descriptors.means):
         raise DataFailure(descriptors.notes["none"])
-    if other := [name for name in SEEN if descriptors.notes["settings"][name] != knowledge.describe[name]]:
-        raise DataFailure(f"{path} was taught on descriptors with describe.{other[0]}={knowledge.describe[other[0]]}")
+    if other := [
+        name for name in SEEN if descriptors.notes["settings"][name] != knowledge.describe[name]
+    ]:
+        raise DataFailure(
+            f"{path} was taught on descriptors with "
+            f"describe.{other[0]}={knowledge.describe[other[0]]}"
+        )
     of = descriptors
     return PointInputs(of.own, of.means, of.normals, of.descriptors, of.neighbors)
 
 
 def answered(knowledge: Knowledge, inputs: PointInputs) -> np.ndarray:
-    """What knowledge says of points: f32 [N, 2 d], in the teacher's channels, then in those of words."""
-    return PointEncoder.restored(knowledge.encoder, knowledge.weights).encode(inputs) @ knowledge.map
+    """What knowledge says of points: f32 [N, 2 d], in the teacher's channels, then in those of
+    words.
+    """
+    return (
+        PointEncoder.restored(knowledge.encoder, knowledge.weights).encode(inputs) @ knowledge.map
+    )
 
 
-def into_channels(path: Path, knowledge: Knowledge, features: Features) -> Callable[[np.ndarray], np.ndarray]:
+def into_channels(
+    path: Path, knowledge: Knowledge, features: Features
+) -> Callable[[np.ndarray], np.ndarray]:
     """From answers [N, 2 d] to the scene's channels [N, C]: by the teacher's channels, or by words.
 
-    Raises: InputError where the knowledge is of another teacher than the scene's; DataFailure where it has no word for
+    Raises: InputError where the knowledge is of another teacher than the scene's; DataFailure where
+      it has no word for
             any of its labels.
-    Choices: through the teacher's channels nothing is lost but what the scene leaves out. Where a scene's features are
-      codes of classes (noisy labels, labels of a source, segmenters), an answer becomes the mean of the codes, weighted
-      by how near it is to the embeddings of their names; a label without a word gets no vote.
+    Choices: through the teacher's channels nothing is lost but what the scene leaves out. Where a
+      scene's features are codes of classes (noisy labels, labels of a source, segmenters), an
+      answer becomes the mean of the codes, weighted by how near it is to the embeddings of their
+      names; a label without a word gets no vote.
     """
     half = len(knowledge.map[0]) // 2
     if of_features(features):
@@ -58,9 +75,12 @@ def into_channels(path: Path, knowledge: Knowledge, features: Features) -> Calla
     return lambda answers: shares(answers[:, half:], embeddings, TEMPERATURE) @ codes
 
 
-def into_meanings(path: Path, knowledge: Knowledge, features: Features) -> Callable[[int], np.ndarray]:
-    """What the teacher means by each entry of a view, f32 [h, w, d] of a view's number: in its channels as knowledge
-    has them, or the words of its labels; zero where it says nothing, or what knowledge has no word for.
+def into_meanings(
+    path: Path, knowledge: Knowledge, features: Features
+) -> Callable[[int], np.ndarray]:
+    """What the teacher means by each entry of a view, f32 [h, w, d] of a view's number: in its
+    channels as knowledge has them, or the words of its labels; zero where it says nothing, or what
+    knowledge has no word for.
 
     Raises: as `into_channels`.
     """
@@ -73,48 +93,66 @@ def into_meanings(path: Path, knowledge: Knowledge, features: Features) -> Calla
     def meanings(view: int) -> np.ndarray:
         if features.pseudo_labels is not None:
             return words[features.pseudo_labels[view]]
-        return words[decode_labels(features.features[view].astype(np.float32), features.label_embeddings)]
+        return words[
+            decode_labels(features.features[view].astype(np.float32), features.label_embeddings)
+        ]
 
     return meanings
 
 
 def to_knowledge(knowledge: Knowledge, features: Features) -> np.ndarray:
     """The matrix f32 [C, d] from a scene's channels, of a teacher's features, to knowledge's."""
-    return knowledge.matrix if features.channels is None else features.channels.inverse @ knowledge.matrix
+    return (
+        knowledge.matrix
+        if features.channels is None
+        else features.channels.inverse @ knowledge.matrix
+    )
 
 
 def words_by_label(knowledge: Knowledge, features: Features) -> np.ndarray:
-    """The unit embedding of each label's word, f32 [L + 1, d]; zero of labels without one, and last of no label."""
+    """The unit embedding of each label's word, f32 [L + 1, d]; zero of labels without one, and last
+    of no label.
+    """
     rows = np.array([*found(features.label_names, knowledge.words), -1])
     return np.where(rows[:, None] >= 0, units(knowledge.embeddings[rows]), 0).astype(np.float32)
 
 
 def of_features(features: Features) -> bool:
     """Whether a scene's channels are those of its teacher, and not codes of classes."""
-    return bool(features.convention["kind"] == "onnx" and features.convention["output"] == "features")
+    return bool(
+        features.convention["kind"] == "onnx" and features.convention["output"] == "features"
+    )
 
 
 def check_teacher(path: Path, knowledge: Knowledge, features: Features) -> None:
-    """Raises InputError where knowledge is of another teacher than the features, or of another version of it."""
+    """Raises InputError where knowledge is of another teacher than the features, or of another
+    version of it.
+    """
     teacher, channels = features.convention["teacher"], features.channels
     if teacher != knowledge.teacher:
         raise InputError(
-            f"{path} was taught for the teacher {knowledge.teacher}, the scene has {teacher}; teach knowledge for it "
+            f"{path} was taught for the teacher {knowledge.teacher}, the scene has {teacher}; "
+            "teach knowledge for it "
             "(`chebsplat knowledge teach`)"
         )
     if channels is not None and channels.notes.get("digest") != knowledge.digest:
-        raise InputError(f"{path} was taught for another version of {knowledge.teacher}; teach it again")
+        raise InputError(
+            f"{path} was taught for another version of {knowledge.teacher}; teach it again"
+        )
 
 
 def words_of(path: Path, knowledge: Knowledge, features: Features) -> tuple[list[int], np.ndarray]:
-    """Labels of the scene that knowledge has a word for, and the unit embeddings f32 [L', d] of these.
+    """Labels of the scene that knowledge has a word for, and the unit embeddings f32 [L', d] of
+    these.
 
     Raises: DataFailure where there is none.
     """
     rows = found(features.label_names, knowledge.words)
     named = [label for label, row in enumerate(rows) if row >= 0]
     if not named:
-        raise DataFailure(f"{path} has no word for any of the labels, {features.label_names[0]} among them")
+        raise DataFailure(
+            f"{path} has no word for any of the labels, {features.label_names[0]} among them"
+        )
     return named, units(knowledge.embeddings[[rows[label] for label in named]])
 
 

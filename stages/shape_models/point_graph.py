@@ -1,6 +1,8 @@
-"""The point encoder as an ONNX graph, operation by operation as torch computes it, and its contract.
+"""The point encoder as an ONNX graph, operation by operation as torch computes it, and its
+contract.
 
-Written by hand: torch's own exporter traces for 20 s and more. The stage `onnx` compares it with torch at every export.
+Written by hand: torch's own exporter traces for 20 s and more. The stage `onnx` compares it with
+  torch at every export.
 """
 
 from __future__ import annotations
@@ -23,18 +25,24 @@ Value = Any  # the name of what a node makes, a torch tensor, or a NumPy constan
 
 
 class Graph:
-    """Nodes in the order of their making. Dimensions of inputs and outputs are numbers, or names of any size from 1."""
+    """Nodes in the order of their making. Dimensions of inputs and outputs are numbers, or names of
+    any size from 1.
+    """
 
     def __init__(self, **inputs: tuple[int, list[int | str]]):
         """inputs: by name, element type and shape."""
-        self.inputs = [helper.make_tensor_value_info(name, *entry) for name, entry in inputs.items()]
+        self.inputs = [
+            helper.make_tensor_value_info(name, *entry) for name, entry in inputs.items()
+        ]
         self.nodes: list[NodeProto] = []
         self.constants: list[TensorProto] = []
 
     def add(self, operator: str, *inputs: Value, **attributes: Any) -> str:
         """One node with one output; gives its name."""
         made = f"{operator.lower()}_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(operator, [self._name(v) for v in inputs], [made], **attributes))
+        self.nodes.append(
+            helper.make_node(operator, [self._name(v) for v in inputs], [made], **attributes)
+        )
         return made
 
     def _name(self, value: Value) -> str:
@@ -42,7 +50,9 @@ class Graph:
             return value
         array = value if isinstance(value, np.ndarray) else value.detach().numpy()
         name = f"constant_{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name))
+        self.constants.append(
+            numpy_helper.from_array(np.ascontiguousarray(array).reshape(array.shape), name)
+        )
         return name
 
     def linear(self, values: Value, layer: Any) -> str:
@@ -50,14 +60,21 @@ class Graph:
         return self.add("Add", self.add("MatMul", values, layer.weight.T), layer.bias)
 
     def model(self, name: str, **outputs: tuple[str, list[int | str]]) -> ModelProto:
-        """outputs: by name, the float32 value that it is, and its shape. Raises onnx.checker.ValidationError."""
+        """outputs: by name, the float32 value that it is, and its shape. Raises
+        onnx.checker.ValidationError.
+        """
         for output, (value, _) in outputs.items():
             self.nodes.append(helper.make_node("Identity", [value], [output]))
-        made = [helper.make_tensor_value_info(o, TensorProto.FLOAT, shape) for o, (_, shape) in outputs.items()]
+        made = [
+            helper.make_tensor_value_info(o, TensorProto.FLOAT, shape)
+            for o, (_, shape) in outputs.items()
+        ]
         graph: GraphProto = helper.make_graph(self.nodes, name, self.inputs, made, self.constants)
         opsets = [helper.make_opsetid("", OPSET)]
         version = helper.find_min_ir_version_for(opsets)
-        model = helper.make_model(graph, opset_imports=opsets, ir_version=version, producer_name="chebsplat")
+        model = helper.make_model(
+            graph, opset_imports=opsets, ir_version=version, producer_name="chebsplat"
+        )
         checker.check_model(model)
         return model
 
@@ -73,7 +90,9 @@ def whole(*values: int) -> np.ndarray:
 
 
 def point_model(encoder: PointEncoder, answers: np.ndarray) -> ModelProto:
-    """The encoder, then a map W [p, d]: arrays of `PointInputs`, neighbors int64 -> answers [points, d]."""
+    """The encoder, then a map W [p, d]: arrays of `PointInputs`, neighbors int64 -> answers
+    [points, d].
+    """
     n_scales, n_descriptors = encoder.settings["n_scales"], encoder.settings["n_descriptors"]
     kind = TensorProto.FLOAT
     inputs: dict[str, tuple[int, list[int | str]]] = {
@@ -83,22 +102,29 @@ def point_model(encoder: PointEncoder, answers: np.ndarray) -> ModelProto:
         "descriptors": (kind, ["points", n_descriptors]),
         "neighbors": (TensorProto.INT64, ["points", n_scales, "neighbors"]),
     }
-    graph = Graph(**{name: entry for name, entry in inputs.items() if name != "descriptors" or n_descriptors})
+    graph = Graph(
+        **{name: entry for name, entry in inputs.items() if name != "descriptors" or n_descriptors}
+    )
     parts = [_standardized(graph, "own", encoder.norm_own)]
     if n_descriptors:
         standard = _standardized(graph, "descriptors", encoder.norm_descriptors)
         parts.append(graph.add("MatMul", standard, encoder.components))
     first, _, second = encoder.embed
-    embedded = graph.linear(_silu(graph, graph.linear(graph.add("Concat", *parts, axis=-1), first)), second)
+    embedded = graph.linear(
+        _silu(graph, graph.linear(graph.add("Concat", *parts, axis=-1), first)), second
+    )
     pooled = [embedded]
     for index, scale in enumerate(encoder.scales.children()):
         rows = graph.add("Gather", "neighbors", whole(index), axis=1)
-        pooled.append(_attended(graph, scale, embedded, graph.add("Squeeze", rows, whole(1)), RADII[index]))  # type: ignore[arg-type]
+        rows = graph.add("Squeeze", rows, whole(1))
+        pooled.append(_attended(graph, scale, embedded, rows, RADII[index]))  # type: ignore[arg-type]
     seen = decoded = graph.add("Concat", *pooled, axis=-1)
     for layer in list(encoder.decode)[::2]:
         decoded = _silu(graph, graph.linear(decoded, layer))
     features, constant = answers[:-1], answers[-1]  # the last feature is 1
-    said = graph.add("Add", graph.add("MatMul", graph.add("Concat", seen, decoded, axis=-1), features), constant)
+    said = graph.add(
+        "Add", graph.add("MatMul", graph.add("Concat", seen, decoded, axis=-1), features), constant
+    )
     return graph.model("points", answers=(said, ["points", answers.shape[1]]))
 
 
@@ -118,26 +144,44 @@ def _attended(graph: Graph, scale: Scale, embedded: str, neighbors: str, radius:
     own = graph.add("Unsqueeze", graph.linear(embedded, scale.point), whole(1))
     others = graph.add("Gather", graph.add("MatMul", embedded, scale.neighbor.weight.T), rows)
     before, _, after = scale.place
-    lying = graph.add("MatMul", _silu(graph, graph.linear(_relative(graph, rows, radius), before)), after.weight.T)
+    lying = graph.add(
+        "MatMul", _silu(graph, graph.linear(_relative(graph, rows, radius), before)), after.weight.T
+    )
     tokens = graph.add("Add", graph.add("Add", own, others), lying)
     fed = _fed(graph, scale, tokens)
-    count = graph.add("ReduceSum", graph.add("Cast", there, to=TensorProto.FLOAT), whole(1), keepdims=0)
+    count = graph.add(
+        "ReduceSum", graph.add("Cast", there, to=TensorProto.FLOAT), whole(1), keepdims=0
+    )
     total = graph.add("ReduceSum", graph.add("Where", there, fed, number(0)), whole(1), keepdims=0)
     mean = graph.add("Div", total, graph.add("Max", count, number(1)))
     if not scale.attends:
-        largest = graph.add("ReduceMax", graph.add("Where", there, fed, number(-1e9)), whole(1), keepdims=0)
+        largest = graph.add(
+            "ReduceMax", graph.add("Where", there, fed, number(-1e9)), whole(1), keepdims=0
+        )
         largest = graph.add("Where", graph.add("Greater", count, number(0)), largest, number(0))
         return graph.add("Concat", largest, mean, axis=-1)
-    normal, asked, learned = _normalized(graph, tokens, scale.norm), scale.asked(), scale.norm(scale.token)
+    normal, asked, learned = (
+        _normalized(graph, tokens, scale.norm),
+        scale.asked(),
+        scale.norm(scale.token),
+    )
     scores = graph.add("Where", there, graph.add("MatMul", normal, asked), number(-1e9))
-    itself = graph.add("Expand", (learned @ asked)[None, None], _sizes(graph, rows, 1, asked.shape[1]))
+    itself = graph.add(
+        "Expand", (learned @ asked)[None, None], _sizes(graph, rows, 1, asked.shape[1])
+    )
     shares = graph.add("Softmax", graph.add("Concat", scores, itself, axis=1), axis=1)
     of_others = graph.add("Slice", shares, whole(0), whole(-1), whole(1))
     of_itself = graph.add("Slice", shares, whole(-1), whole(2**31), whole(1))
-    of_others, of_itself = (graph.add("Transpose", of, perm=[0, 2, 1]) for of in (of_others, of_itself))
-    gathered = graph.add("Add", graph.add("MatMul", of_others, normal), graph.add("Mul", of_itself, learned))
+    of_others, of_itself = (
+        graph.add("Transpose", of, perm=[0, 2, 1]) for of in (of_others, of_itself)
+    )
+    gathered = graph.add(
+        "Add", graph.add("MatMul", of_others, normal), graph.add("Mul", of_itself, learned)
+    )
     gathered = graph.add("Reshape", gathered, whole(-1, asked.shape[0] * asked.shape[1]))
-    token = graph.add("Add", graph.add("MatMul", gathered, scale.answered().flatten(0, 1)), scale.token)
+    token = graph.add(
+        "Add", graph.add("MatMul", gathered, scale.answered().flatten(0, 1)), scale.token
+    )
     return graph.add("Concat", _fed(graph, scale, token), mean, axis=-1)
 
 
@@ -148,7 +192,9 @@ def _sizes(graph: Graph, rows: str, *others: int) -> str:
 
 
 def _normalized(graph: Graph, values: str, norm: LayerNorm) -> str:
-    return graph.add("LayerNormalization", values, norm.weight, norm.bias, axis=-1, epsilon=norm.eps)
+    return graph.add(
+        "LayerNormalization", values, norm.weight, norm.bias, axis=-1, epsilon=norm.eps
+    )
 
 
 def _fed(graph: Graph, scale: Scale, values: str) -> str:
@@ -170,28 +216,44 @@ def _relative(graph: Graph, rows: str, radius: float) -> str:
     def part(values: str, start: int, stop: int) -> str:
         return graph.add("Slice", values, whole(start), whole(stop), whole(-1))
 
-    offset = graph.add("Sub", graph.add("Gather", "means", rows), graph.add("Unsqueeze", "means", whole(1)))
+    offset = graph.add(
+        "Sub", graph.add("Gather", "means", rows), graph.add("Unsqueeze", "means", whole(1))
+    )
     offset = graph.add("Div", offset, number(radius))
-    normal, others = graph.add("Unsqueeze", "normals", whole(1)), graph.add("Gather", "normals", rows)
+    normal, others = (
+        graph.add("Unsqueeze", "normals", whole(1)),
+        graph.add("Gather", "normals", rows),
+    )
     along = dot(offset, normal)
     across = graph.add("Sub", offset, graph.add("Mul", along, normal))
     rise = graph.add("Sub", part(others, 2, 3), part(normal, 2, 3))
     sizes = length(offset), length(part(offset, 0, 2)), graph.add("Abs", part(offset, 2, 3))
-    return graph.add("Concat", offset, *sizes, along, length(across), dot(normal, others), rise, axis=-1)
+    return graph.add(
+        "Concat", offset, *sizes, along, length(across), dot(normal, others), rise, axis=-1
+    )
 
 
 def point_contract(encoder: PointEncoder, knowledge: Knowledge) -> dict[str, Any]:
     """What to feed the graph, in which units, and what comes out, as JSON-able values."""
     n, scales, settings = "points", encoder.settings["n_scales"], encoder.settings
     radii = ", ".join(f"{r:g}" for r in RADII[:scales])
-    own = "height above the floor; normal . up and its size; ratios of the local axes; log of the longest"
+    own = (
+        "height above the floor; normal . up and its size; ratios of the local axes; log of the "
+        "longest"
+    )
     return {
         "inputs": {
-            "own": array("float32", [n, N_OWN], "metres, none, none, none, none, log of metres", own),
+            "own": array(
+                "float32", [n, N_OWN], "metres, none, none, none, none, log of metres", own
+            ),
             "means": array("float32", [n, 3], "metres", "where points lie, z up"),
             "normals": array("float32", [n, 3], "none", "unit, towards a camera"),
-            "descriptors": array("float32", [n, settings["n_descriptors"]], "none", f"at {radii} metres (Eqs 4-6)"),
-            "neighbors": array("int64", [n, scales, "neighbors"], "", f"points within {radii} m; -1: none"),
+            "descriptors": array(
+                "float32", [n, settings["n_descriptors"]], "none", f"at {radii} metres (Eqs 4-6)"
+            ),
+            "neighbors": array(
+                "int64", [n, scales, "neighbors"], "", f"points within {radii} m; -1: none"
+            ),
         },
         "outputs": {
             "answers": array(

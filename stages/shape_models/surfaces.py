@@ -1,4 +1,6 @@
-"""Points of a scene's surface, as shape is described of them: where depth shows it, a sweep, or a splat."""
+"""Points of a scene's surface, as shape is described of them: where depth shows it, a sweep, or a
+splat.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +23,15 @@ from chebsplat.stages.reconstruction.thinning import even
 log = logging.getLogger("chebsplat")
 LEAST_SURE = 0.5  # of up, by the cameras
 LEAST_TOLD = 0.5  # of the pixels of a capture without depth, which a sweep must have found
-METRIC = ("generated", "replica", "scannet", "seven_scenes")  # sources whose scene unit is the metre
+# sources whose scene unit is the metre
+METRIC = ("generated", "replica", "scannet", "seven_scenes")
 N_NEIGHBORS = 16  # that give a point its normal and covariance
 
 
 class Cloud(NamedTuple):
-    """Points of a surface: means [P, 3] scene units, normals [P, 3] unit, towards a camera, covariances [P, 3, 3]."""
+    """Points of a surface: means [P, 3] scene units, normals [P, 3] unit, towards a camera,
+    covariances [P, 3, 3].
+    """
 
     means: np.ndarray
     normals: np.ndarray
@@ -39,7 +44,9 @@ def measured(points: Points) -> Cloud:
     Raises: DataFailure where they show too little of one.
     """
     if len(points.means) <= N_NEIGHBORS:
-        raise DataFailure(f"the depth shows {len(points.means)} points of a surface; shape cannot be told")
+        raise DataFailure(
+            f"the depth shows {len(points.means)} points of a surface; shape cannot be told"
+        )
     kept = even(points)
     if len(kept) == len(points.means):
         return Cloud(points.means, points.normals, points.covariances)
@@ -50,7 +57,11 @@ def measured(points: Points) -> Cloud:
 
 
 def shown(
-    parameters: dict[str, np.ndarray], poses: np.ndarray, Ks: np.ndarray, size: tuple[int, int], unit: float
+    parameters: dict[str, np.ndarray],
+    poses: np.ndarray,
+    Ks: np.ndarray,
+    size: tuple[int, int],
+    unit: float,
 ) -> Cloud:
     """The surface that Gaussians show to views, for scenes whose points no depth has measured.
 
@@ -58,7 +69,9 @@ def shown(
     """
     means, eyes = surface(parameters, poses, Ks, size, unit)
     if len(means) <= N_NEIGHBORS:
-        raise DataFailure(f"the Gaussians show {len(means)} points of a surface; shape cannot be told")
+        raise DataFailure(
+            f"the Gaussians show {len(means)} points of a surface; shape cannot be told"
+        )
     return facing(means, eyes)
 
 
@@ -71,7 +84,9 @@ def swept(points: Points, width: int, unit: float) -> Cloud:
     Ks = swept_Ks(points, width)
     means, eyes = swept_surface(points.depths, Ks, points.cam_from_world, unit)
     if len(means) <= N_NEIGHBORS:
-        raise DataFailure(f"the photos' depth shows {len(means)} points of a surface; shape cannot be told")
+        raise DataFailure(
+            f"the photos' depth shows {len(means)} points of a surface; shape cannot be told"
+        )
     return facing(means, eyes)
 
 
@@ -83,14 +98,18 @@ def swept_Ks(points: Points, width: int) -> np.ndarray:
 
 
 def facing(means: np.ndarray, eyes: np.ndarray) -> Cloud:
-    """Points [P, 3] with the shape of their neighbours, and normals towards the cameras [P, 3] that saw them."""
+    """Points [P, 3] with the shape of their neighbours, and normals towards the cameras [P, 3] that
+    saw them.
+    """
     covariances, normals = local_shape(means, N_NEIGHBORS)
     normals[np.einsum("ni,ni->n", normals, eyes - means) < 0] *= -1
     return Cloud(means, normals, covariances)
 
 
 def up_of(poses: np.ndarray) -> tuple[np.ndarray, float]:
-    """Against gravity [3], and how sure that is. Choices: z, with a warning, where the cameras cannot tell."""
+    """Against gravity [3], and how sure that is. Choices: z, with a warning, where the cameras
+    cannot tell.
+    """
     up, sure = common_up(poses)
     if sure >= LEAST_SURE:
         return up, sure
@@ -99,18 +118,22 @@ def up_of(poses: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def scene_unit(capture: Capture | None, means: np.ndarray) -> tuple[float, str]:
-    """Scene units of a metre, and what says so: the source's where it is metric or has depth, otherwise the extent."""
+    """Scene units of a metre, and what says so: the source's where it is metric or has depth,
+    otherwise the extent.
+    """
     if capture is not None and (capture.depth is not None or capture.source.get("kind") in METRIC):
         return 1 / World.read(capture.source).scale, "source"
     return room_unit(means), "extent"
 
 
 def surface_in(capture: Capture, points: Points, unit: float) -> tuple[Cloud, str]:
-    """The surface that the capture's depth shows, or a sweep of its photos, and which of both it is.
+    """The surface that the capture's depth shows, or a sweep of its photos, and which of both it
+    is.
 
     Raises: DataFailure where neither shows enough of one.
-    Choices: where fewer than half of the pixels have swept depth, things stand alone that walls surround: shape was
-      right for 70 % of what is near its points, where smoothed features were for 82 % (two rooms, ten photos each).
+    Choices: where fewer than half of the pixels have swept depth, things stand alone that walls
+      surround: shape was right for 70 % of what is near its points, where smoothed features were
+        for 82 % (two rooms, ten photos each).
       What Gaussians show that ten photos have placed is right for half of them.
     """
     if capture.depth is not None:
@@ -122,7 +145,8 @@ def surface_in(capture: Capture, points: Points, unit: float) -> tuple[Cloud, st
     share = float(np.mean(points.depths[used] > 0)) if used else 0.0
     if share < LEAST_TOLD:
         raise DataFailure(
-            f"the capture has no depth, and a sweep of its photos finds that of {share:.0%} of their pixels: too little"
+            f"the capture has no depth, and a sweep of its photos finds that of {share:.0%} of "
+            "their pixels: too little"
         )
     return swept(points, capture.size[0], unit), "swept depth"
 
@@ -130,4 +154,6 @@ def surface_in(capture: Capture, points: Points, unit: float) -> tuple[Cloud, st
 def in_scene(of: Descriptors) -> tuple[np.ndarray, np.ndarray]:
     """Described points in the scene's own frame and units: means and unit normals f64 [N, 3]."""
     turn = upright(np.array(of.up))
-    return of.means.astype(np.float64) @ turn * of.unit + of.origin, of.normals.astype(np.float64) @ turn
+    return of.means.astype(np.float64) @ turn * of.unit + of.origin, of.normals.astype(
+        np.float64
+    ) @ turn

@@ -1,4 +1,6 @@
-"""Generated rooms as the point encoder is taught on them: their points, their shape, and what a 2D teacher says."""
+"""Generated rooms as the point encoder is taught on them: their points, their shape, and what a 2D
+teacher says.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ N_NEIGHBORS = 16  # that give a point its normal and covariance
 
 
 class Room(NamedTuple):
-    """Inputs of N points, mean unit features [N, d], how many views see each [N], and its label [N], -1: none."""
+    """Inputs of N points, mean unit features [N, d], how many views see each [N], and its label
+    [N], -1: none.
+    """
 
     inputs: PointInputs
     features: np.ndarray
@@ -45,16 +49,20 @@ class Room(NamedTuple):
     labels: np.ndarray
 
 
-def rooms_of(seed: int, settings: TeachSection, network: TeacherInference, matrix: np.ndarray) -> list[Room]:
-    """A room furnished, photographed, seen by the teacher, and described: as depth has it, worn (`worn`), as few of its
-    photos show it, and as their sweep does (`swept`).
+def rooms_of(
+    seed: int, settings: TeachSection, network: TeacherInference, matrix: np.ndarray
+) -> list[Room]:
+    """A room furnished, photographed, seen by the teacher, and described: as depth has it, worn
+    (`worn`), as few of its photos show it, and as their sweep does (`swept`).
 
-    Args: seed: of `synthetic.seeds.KNOWLEDGE`; matrix [C, d]: from the teacher's channels to those of scenes.
+    Args: seed: of `synthetic.seeds.KNOWLEDGE`; matrix [C, d]: from the teacher's channels to those
+      of scenes.
     Raises: ValueError on another seed.
-    Choices: labels are there to measure by; nothing is taught from them. Points of the worn room are taught what the
-      teacher says of the places that they were moved from; points of few photos, and of a sweep, what it says in all of
-      them. Every other room that few photos show has other proportions, too: worlds differ in these. A sweep that finds
-      nothing leaves the room as depth has it once more.
+    Choices: labels are there to measure by; nothing is taught from them. Points of the worn room
+      are taught what the teacher says of the places that they were moved from; points of few
+      photos, and of a sweep, what it says in all of them. Every other room that few photos show has
+      other proportions, too: worlds differ in these. A sweep that finds nothing leaves the room as
+        depth has it once more.
     """
     if seed not in KNOWLEDGE:
         raise ValueError(f"seed {seed} is not one for knowledge: {KNOWLEDGE}")
@@ -62,14 +70,19 @@ def rooms_of(seed: int, settings: TeachSection, network: TeacherInference, matri
     images, depth, labels, K, poses = photographed(seed, settings.n_views)
     Ks = np.tile(K, (len(poses), 1, 1))
     grid, _ = network.grid(images[0], 4)
-    features = np.stack([network.features(image, grid, (1.0,), False, f"room {seed}") @ matrix for image in images])
+    features = np.stack(
+        [network.features(image, grid, (1.0,), False, f"room {seed}") @ matrix for image in images]
+    )
     count = round(settings.n_points * rng.uniform(*DENSITY))
     means, eyes, named = surface(depth, labels, K, poses, count, rng)
     clean = described(means, eyes)
     mean, n_views = averaged(means, depth, features, features.shape[-1], Ks, poses)
     moved, rows, adrift = worn(means, clean.normals, rng)
     seen = np.where(adrift, 0, n_views[rows])
-    rooms = [Room(clean, mean, n_views, named), Room(described(moved, eyes[rows]), mean[rows], seen, named[rows])]
+    rooms = [
+        Room(clean, mean, n_views, named),
+        Room(described(moved, eyes[rows]), mean[rows], seen, named[rows]),
+    ]
     few = np.sort(rng.permutation(len(poses))[: int(np.exp(rng.uniform(*np.log(FEW_VIEWS))))])
     some, lookers, called = surface(depth[few], labels[few], K, poses[few], count, rng)
     mean, n_views = averaged(some, depth, features, features.shape[-1], Ks, poses)
@@ -78,7 +91,9 @@ def rooms_of(seed: int, settings: TeachSection, network: TeacherInference, matri
     found = swept(images, depth, K, poses, rng)
     if len(found.means) <= N_NEIGHBORS:
         return [*rooms, rooms[0]]
-    mean, n_views = averaged(found.means, depth, features, features.shape[-1], Ks, poses, SWEPT_WITHIN)
+    mean, n_views = averaged(
+        found.means, depth, features, features.shape[-1], Ks, poses, SWEPT_WITHIN
+    )
     _, nearest = cKDTree(means).query(found.means)
     return [*rooms, Room(described(*found), mean, n_views, named[nearest])]
 
@@ -90,11 +105,15 @@ def described(means: np.ndarray, eyes: np.ndarray) -> PointInputs:
     return point_inputs(means, normals, covariances, up=np.array([0.0, 0.0, 1.0]))
 
 
-def worn(means: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points as scenes have them whose depth is only rendered: [M, 3], the rows they were, and which of them float.
+def worn(
+    means: np.ndarray, normals: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points as scenes have them whose depth is only rendered: [M, 3], the rows they were, and
+    which of them float.
 
-    Choices: a share of the points; they leave the surface along its normal, by offsets that change slowly over it (half
-      a metre to a metre, and a few hands), and by noise; some float in front of it.
+    Choices: a share of the points; they leave the surface along its normal, by offsets that change
+      slowly over it (half a metre to a metre, and a few hands), and by noise; some float in front
+      of it.
     """
     kept = rng.permutation(len(means))[: int(rng.uniform(0.4, 1) * len(means))]
     normal = normals[kept]
@@ -103,20 +122,31 @@ def worn(means: np.ndarray, normals: np.ndarray, rng: np.random.Generator) -> tu
     for largest, wavelengths in ((0.05, (0.4, 1.2)), (0.03, (0.1, 0.3))):
         waves = rng.normal(size=(64, 3)) * 2 * np.pi / np.sqrt(3) / rng.uniform(*wavelengths)
         phases = rng.uniform(0, 2 * np.pi, 64)
-        offset = offset + rng.uniform(0, largest) * np.sqrt(2 / 64) * np.cos(where @ waves.T + phases).sum(1)
+        offset = offset + rng.uniform(0, largest) * np.sqrt(2 / 64) * np.cos(
+            where @ waves.T + phases
+        ).sum(1)
     adrift = rng.random(len(kept)) < rng.uniform(0, 0.04)
     offset = np.where(adrift, np.abs(rng.normal(0, 0.15, len(kept))), offset)
     noise = rng.uniform(0.001, 0.015) * rng.normal(size=where.shape)
     return means[kept] + offset[:, None] * normal + noise, kept, adrift
 
 
-def swept(images: np.ndarray, depth: np.ndarray, K: np.ndarray, poses: np.ndarray, rng: np.random.Generator) -> Surface:
-    """The surface that a sweep of LEAST_SWEPT or more of the photos finds, as in a scene without depth.
+def swept(
+    images: np.ndarray,
+    depth: np.ndarray,
+    K: np.ndarray,
+    poses: np.ndarray,
+    rng: np.random.Generator,
+) -> Surface:
+    """The surface that a sweep of LEAST_SWEPT or more of the photos finds, as in a scene without
+    depth.
 
     Args: depth [V, H, W]: true; 200 pixels of each photo bound what is tried, as matched points do.
     """
     least = min(LEAST_SWEPT, len(poses))
-    some = np.sort(rng.permutation(len(poses))[: round(np.exp(rng.uniform(*np.log((least, len(poses))))))])
+    some = np.sort(
+        rng.permutation(len(poses))[: round(np.exp(rng.uniform(*np.log((least, len(poses))))))]
+    )
     factor = max(round(max(images.shape[1:3]) / SIDE), 1)
     colors = np.stack([reduced(image, factor) for image in images[some]]) / 255
     Ks = np.tile(K * [[1 / factor], [1 / factor], [1]], (len(some), 1, 1))
@@ -125,7 +155,9 @@ def swept(images: np.ndarray, depth: np.ndarray, K: np.ndarray, poses: np.ndarra
     return swept_surface(found, Ks, poses[some])
 
 
-def photographed(seed: int, n_views: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def photographed(
+    seed: int, n_views: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Images, depth and labels [V, H, W, ...] of a room, K [3, 3] and poses [V, 4, 4]."""
     kind = KINDS[seed % len(KINDS)]
     room = shuffled(seed) if kind == "shuffled" else layout.build(kind.split()[-1], seed)
@@ -139,13 +171,22 @@ def photographed(seed: int, n_views: int) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def surface(
-    depth: np.ndarray, labels: np.ndarray, K: np.ndarray, poses: np.ndarray, count: int, rng: np.random.Generator
+    depth: np.ndarray,
+    labels: np.ndarray,
+    K: np.ndarray,
+    poses: np.ndarray,
+    count: int,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """About `count` points [N, 3] that views see, the cameras that saw them [N, 3], and their labels [N]."""
+    """About `count` points [N, 3] that views see, the cameras that saw them [N, 3], and their
+    labels [N].
+    """
     means, eyes, named = [], [], []
     for view, eye in enumerate(centers(poses)):
         pixels = np.argwhere(np.isfinite(depth[view]))
-        pixels = pixels[rng.choice(len(pixels), min(4 * count // len(poses), len(pixels)), replace=False)]
+        pixels = pixels[
+            rng.choice(len(pixels), min(4 * count // len(poses), len(pixels)), replace=False)
+        ]
         means.append(unproject(depth[view], K, poses[view], pixels))
         eyes.append(np.tile(eye, (len(pixels), 1)))
         named.append(labels[view][pixels[:, 0], pixels[:, 1]])
@@ -155,14 +196,22 @@ def surface(
 
 
 def prepare(folder: Path, seed: int, settings: TeachSection, matrix: np.ndarray) -> int:
-    """Keep a room in the folder, unless it is there; returns the seed. Runs in a process of its own."""
+    """Keep a room in the folder, unless it is there; returns the seed. Runs in a process of its
+    own.
+    """
     path = kept_as(folder, seed)
     if path.is_file():
         return seed
-    network = TeacherInference(read_teacher(Path(settings.model) if settings.model else EMBEDDED), 1)
+    network = TeacherInference(
+        read_teacher(Path(settings.model) if settings.model else EMBEDDED), 1
+    )
     arrays: dict[str, np.ndarray] = {}
     for number, room in enumerate(rooms_of(seed, settings, network, matrix)):
-        values = room.inputs._asdict() | {"features": room.features, "n_views": room.n_views, "labels": room.labels}
+        values = room.inputs._asdict() | {
+            "features": room.features,
+            "n_views": room.n_views,
+            "labels": room.labels,
+        }
         arrays |= {f"{name}{number}": value for name, value in values.items()}
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]  # of NumPy's stubs

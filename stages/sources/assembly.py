@@ -1,4 +1,6 @@
-"""From frames to the fields of a capture: images and what belongs to them as pinhole views of one size."""
+"""From frames to the fields of a capture: images and what belongs to them as pinhole views of one
+size.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +22,23 @@ from chebsplat.formats.images import header
 from chebsplat.labels.agreement import project
 from chebsplat.stages.settings import IngestSection
 from chebsplat.stages.sources import labels
-from chebsplat.stages.sources.cameras import DISTORTED, EQUIRECTANGULAR, FACES, Camera, scaled, undistorted
+from chebsplat.stages.sources.cameras import (
+    DISTORTED,
+    EQUIRECTANGULAR,
+    FACES,
+    Camera,
+    scaled,
+    undistorted,
+)
 from chebsplat.stages.sources.common import Frame, Listing, distinct, natural
-from chebsplat.stages.sources.pictures import DEEP, GREY, companion, confidences, nearest, open_photo
+from chebsplat.stages.sources.pictures import (
+    DEEP,
+    GREY,
+    companion,
+    confidences,
+    nearest,
+    open_photo,
+)
 
 WORKERS = 4
 MOST_EMPTY = 1 / 3  # of the views that see a point
@@ -30,50 +46,75 @@ OWN_SIDE = 1600  # pixels: what photos as taken are reduced to, as in published 
 COMPARED = 8  # views whose variance is held against their photos'
 
 
-def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
+def assemble(
+    listing: Listing, settings: IngestSection, class_names: tuple[str, ...] | None = None
+) -> dict[str, Any]:
     """Read all frames into the fields of a capture.
 
-    Choices: `max_views` picks evenly from the naturally sorted frames. Images are reduced to `max_side` by averaging,
-      and undistorted in the same step where a lens bends them (`resampled`); depth, labels and masks take the nearest
-      pixel of the file. Smaller views are padded at the right and the bottom, where the loss mask is false, as it is
-      in a photo that is all transparent. Depth is taken only if every frame of the source has it; pixels of a frame
+    Choices: `max_views` picks evenly from the naturally sorted frames. Images are reduced to
+      `max_side` by averaging, and undistorted in the same step where a lens bends them
+      (`resampled`); depth, labels and masks take the nearest pixel of the file. Smaller views are
+      padded at the right and the bottom, where the loss mask is false, as it is in a photo that is
+      all transparent. Depth is taken only if every frame of the source has it; pixels of a frame
       without labels have none.
-    Raises:  InputError naming a bad file, DataFailure under `min_views` or where no label has a name.
+    Raises:  InputError naming a bad file, DataFailure under `min_views` or where no label has a
+      name.
     """
     frames, notes = chosen(listing, settings)
     shapes = [geometry(frame.camera, settings.max_side) for frame in frames]
-    full = (len(frames), max(shape.height for shape in shapes), max(shape.width for shape in shapes))
+    full = (
+        len(frames),
+        max(shape.height for shape in shapes),
+        max(shape.width for shape in shapes),
+    )
     stacks = empty_stacks(listing, frames, full, notes)
     lookup = functools.lru_cache(8)(positions)  # frames of one camera share it
     compared = np.linspace(0, len(frames) - 1, min(COMPARED, len(frames))).astype(int)
 
     def fill(k: int) -> None:
-        view = read_view(frames[k], listing, shapes[k], lookup(frames[k].camera, shapes[k]), set(stacks))
+        view = read_view(
+            frames[k], listing, shapes[k], lookup(frames[k].camera, shapes[k]), set(stacks)
+        )
         if not view["opaque"].all():
             listing.empty[frames[k].name] = ~view["opaque"]
         for name in stacks.keys() & view.keys():
             stacks[name][k, : shapes[k].height, : shapes[k].width] = view[name]
 
     def share_kept(k: int) -> float:
-        camera, pixels = frames[k].camera, stacks["images"][k, : shapes[k].height, : shapes[k].width]
-        with open_photo(frames[k].image, (camera.width, camera.height), listing.upright) as (image, _):
+        camera, pixels = (
+            frames[k].camera,
+            stacks["images"][k, : shapes[k].height, : shapes[k].width],
+        )
+        with open_photo(frames[k].image, (camera.width, camera.height), listing.upright) as (
+            image,
+            _,
+        ):
             return variance_kept(image, pixels, lookup(camera, shapes[k]))
 
     with ThreadPoolExecutor(WORKERS) as pool:
         list(pool.map(fill, range(len(frames))))
         shares = list(pool.map(share_kept, compared))
     if not stacks["loss_mask"].any():
-        raise DataFailure(f"{frames[0].mask or frames[0].image}: no pixel of any view counts; correct the masks")
+        raise DataFailure(
+            f"{frames[0].mask or frames[0].image}: no pixel of any view counts; correct the masks"
+        )
     source: dict[str, Any] = {"kind": listing.kind, "notes": notes}
-    fields: dict[str, Any] = {"source": source, "names": [frame.name for frame in frames], "images": stacks["images"]}
+    fields: dict[str, Any] = {
+        "source": source,
+        "names": [frame.name for frame in frames],
+        "images": stacks["images"],
+    }
     fields["Ks"] = np.stack([shape.K for shape in shapes])
-    fields["cam_from_world"] = np.stack([frame.pose for frame in frames]) if listing.has("pose") else None  # type: ignore[misc]
+    poses = [frame.pose for frame in frames if frame.pose is not None]
+    fields["cam_from_world"] = np.stack(poses) if listing.has("pose") else None
     if "depth" in stacks:
         fields["depth"] = stacks["depth"]
     if "labels" in stacks:
         wanted = class_names or listing.class_names
         kind, raw = labels.resolved(listing, stacks.pop("labels"))
-        fields["labels"], fields["class_names"], remarks = labels.indexed(raw, listing.label_names, wanted, kind)
+        fields["labels"], fields["class_names"], remarks = labels.indexed(
+            raw, listing.label_names, wanted, kind
+        )
         notes += remarks
         source["labels"] = labels.line(listing, kind, fields["labels"])
     if "pseudo_labels" in stacks:
@@ -84,14 +125,20 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
         fields["confidence"] = stacks["confidence"]
         notes += remarks
     if listing.empty:
-        notes.append(f"{len(listing.empty)} of {len(frames)} photos have transparent pixels, which are empty space.")
+        notes.append(
+            f"{len(listing.empty)} of {len(frames)} photos have transparent pixels, which are "
+            "empty space."
+        )
     if not stacks["loss_mask"].all():
         fields["loss_mask"] = stacks["loss_mask"]
         notes.append(f"{1 - stacks['loss_mask'].mean():.1%} of the pixels are masked.")
     if (least := min(shape.factor for shape in shapes)) < 1:
         notes.append(f"Images are reduced by {least:.3f} (ingest.max_side).")
     if models := sorted({frame.camera.model for frame in frames} & set(DISTORTED)):
-        notes.append(f"Images are undistorted ({', '.join(models)}), and figures are of these where they do not say.")
+        notes.append(
+            f"Images are undistorted ({', '.join(models)}), and figures are of these where they "
+            "do not say."
+        )
         source["undistorted"] = models
     fields["variance_kept"] = float(np.mean(shares))
     return fields | {"altered": lambda wanted: altered(frames, listing, wanted, settings.max_side)}
@@ -100,18 +147,23 @@ def assemble(listing: Listing, settings: IngestSection, class_names: tuple[str, 
 def altered(
     frames: list[Frame], listing: Listing, wanted: set[str], max_side: int
 ) -> Iterator[tuple[str, Camera, Any]]:
-    """Name, camera and photo of the `wanted` views that are undistorted or reduced, but of no face of a photo."""
+    """Name, camera and photo of the `wanted` views that are undistorted or reduced, but of no face
+    of a photo.
+    """
     for frame in frames:
         camera = frame.camera
         changed = camera.model in DISTORTED or max(camera.width, camera.height) > max_side
         if frame.name in wanted and changed and camera.model != EQUIRECTANGULAR:
-            with open_photo(frame.image, (camera.width, camera.height), listing.upright) as (image, _):
+            with open_photo(frame.image, (camera.width, camera.height), listing.upright) as (
+                image,
+                _,
+            ):
                 yield frame.name, camera, image
 
 
 def as_taken(photos: Iterable[tuple[str, Camera, Any]]) -> dict[str, Any]:
-    """Fields `taken` u8 [T, H, W, 3] and `lenses` of a capture: photos as they are, reduced to OWN_SIDE, each with its
-    name and camera; smaller ones are padded at the right and the bottom.
+    """Fields `taken` u8 [T, H, W, 3] and `lenses` of a capture: photos as they are, reduced to
+    OWN_SIDE, each with its name and camera; smaller ones are padded at the right and the bottom.
     """
     small, lenses = [], []
     for name, camera, image in photos:
@@ -132,7 +184,9 @@ def as_taken(photos: Iterable[tuple[str, Camera, Any]]) -> dict[str, Any]:
 def empty_stacks(
     listing: Listing, frames: list[Frame], full: tuple[int, int, int], notes: list[str]
 ) -> dict[str, np.ndarray]:
-    """Empty stacks of what the views will have, by name; notes on what only some of them have are added."""
+    """Empty stacks of what the views will have, by name; notes on what only some of them have are
+    added.
+    """
     stacks = {"images": np.zeros((*full, 3), np.uint8), "loss_mask": np.zeros(full, bool)}
     empties = {"depth": np.float32(np.nan), "labels": np.int32(-1), "pseudo_labels": np.int32(0)}
     for name, empty in (empties | {"confidence": np.float16(0)}).items():
@@ -143,15 +197,18 @@ def empty_stacks(
             if n < of:
                 notes.append(f"{n} of {of} views have labels; the others count as unknown.")
         elif n:
-            notes.append(f"Only {n} of {of} frames have {name.replace('_', ' ')}, which are left out.")
+            notes.append(
+                f"Only {n} of {of} frames have {name.replace('_', ' ')}, which are left out."
+            )
     return stacks
 
 
 def in_empty_space(points: np.ndarray, fields: dict[str, Any], listing: Listing) -> np.ndarray:
-    """Which of a source's points [N, 3] lie where photos are transparent, bool [N]; a note says how many.
+    """Which of a source's points [N, 3] lie where photos are transparent, bool [N]; a note says how
+    many.
 
-    Choices: those that more than MOST_EMPTY of the views which have them in sight see as empty; a silhouette may be a
-      pixel off. Without this they would stay, and turn black.
+    Choices: those that more than MOST_EMPTY of the views which have them in sight see as empty; a
+      silhouette may be a pixel off. Without this they would stay, and turn black.
     """
     empty, seen = np.zeros(len(points)), np.zeros(len(points))
     if not listing.empty:
@@ -161,34 +218,50 @@ def in_empty_space(points: np.ndarray, fields: dict[str, Any], listing: Listing)
         local = points @ pose[:3, :3].T + pose[:3, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             place = (local @ K.T)[:, :2] / local[:, 2:]
-        here = np.flatnonzero((local[:, 2] > 0) & ((place >= 0) & (place < clear.shape[::-1])).all(1))
+        here = np.flatnonzero(
+            (local[:, 2] > 0) & ((place >= 0) & (place < clear.shape[::-1])).all(1)
+        )
         column, row = place[here].astype(int).T
         seen[here] += 1
         empty[here] += clear[row, column]
     lost: np.ndarray = empty > MOST_EMPTY * seen
     if lost.any():
-        fields["source"]["notes"].append(f"{lost.sum()} of {len(points)} points lie in empty space and are left out.")
+        fields["source"]["notes"].append(
+            f"{lost.sum()} of {len(points)} points lie in empty space and are left out."
+        )
     return lost
 
 
 def give_split(fields: dict[str, Any], tests: set[str], origin: str) -> None:
-    """Set `is_test` by name, or note that the views that are used leave one side of the split empty."""
+    """Set `is_test` by name, or note that the views that are used leave one side of the split
+    empty.
+    """
     is_test = np.array([name in tests for name in fields["names"]])
     if is_test.any() and not is_test.all():
         fields["is_test"] = is_test
         fields["source"]["notes"].append(f"{is_test.sum()} test views are those of {origin}.")
     else:
-        fields["source"]["notes"].append(f"{origin}'s split leaves no test or no training view; it is not used.")
+        fields["source"]["notes"].append(
+            f"{origin}'s split leaves no test or no training view; it is not used."
+        )
 
 
 def chosen(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list[str]]:
     """The frames to read, and the notes so far."""
     notes, given = list(listing.notes), len(listing.frames)
-    frames = [frame for frame in listing.frames if frame.pose is None or np.isfinite(frame.pose).all()]
+    frames = [
+        frame for frame in listing.frames if frame.pose is None or np.isfinite(frame.pose).all()
+    ]
     if len(frames) < given:
-        notes.append(f"{given - len(frames)} of {given} frames have a pose that is not finite and are left out.")
+        notes.append(
+            f"{given - len(frames)} of {given} frames have a pose that is not finite and are left "
+            "out."
+        )
     if len(frames) < settings.min_views:
-        raise DataFailure(f"{len(frames)} usable frames; ingest.min_views is {settings.min_views}. {' '.join(notes)}")
+        raise DataFailure(
+            f"{len(frames)} usable frames; ingest.min_views is {settings.min_views}. "
+            f"{' '.join(notes)}"
+        )
     frames = sorted(frames, key=lambda frame: natural(frame.name))
     distinct((frame.name, frame.image) for frame in frames)
     if settings.max_views is not None and len(frames) > settings.max_views:
@@ -197,14 +270,22 @@ def chosen(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list
         frames = [frames[k] for k in picked]
     if not listing.upright:  # plain photos have the cameras that they are given
         given_frames = frames
-        frames = [replace(frame, camera=scaled(frame.camera, header(frame.image)[0])) for frame in frames]
-        changed = [new for new, old in zip(frames, given_frames, strict=True) if new.camera != old.camera]
+        frames = [
+            replace(frame, camera=scaled(frame.camera, header(frame.image)[0])) for frame in frames
+        ]
+        changed = [
+            new for new, old in zip(frames, given_frames, strict=True) if new.camera != old.camera
+        ]
         if changed:
-            notes.append(f"Cameras of {len(changed)} views are scaled to their photos, which have another size.")
+            notes.append(
+                f"Cameras of {len(changed)} views are scaled to their photos, which have another "
+                "size."
+            )
     if n := sum(frame.camera.model == EQUIRECTANGULAR for frame in frames):
         frames = [face for frame in frames for face in faces(frame)]
         notes.append(
-            f"{n} photos of all directions give {len(FACES)} views each, without what is near above and below."
+            f"{n} photos of all directions give {len(FACES)} views each, without what is near "
+            "above and below."
         )
     return frames, notes
 
@@ -232,7 +313,9 @@ def faces(frame: Frame) -> list[Frame]:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """The pinhole view made of a photo: K [3, 3] and size in its own pixels; factor: its pixels per photo pixel."""
+    """The pinhole view made of a photo: K [3, 3] and size in its own pixels; factor: its pixels per
+    photo pixel.
+    """
 
     K: np.ndarray
     width: int
@@ -241,19 +324,24 @@ class Geometry:
 
 
 def geometry(camera: Camera, max_side: int) -> Geometry:
-    """The view's camera: undistorted first, then reduced until no side exceeds `max_side`; never enlarged."""
+    """The view's camera: undistorted first, then reduced until no side exceeds `max_side`; never
+    enlarged.
+    """
     plain = undistorted(camera)
     (fx, fy, cx, cy), width, height = plain.pinhole, plain.width, plain.height
     factor = min(1.0, max_side / max(width, height))
     w, h = max(round(width * factor), 1), max(round(height * factor), 1)
-    K = np.array([[fx * w / width, 0, cx * w / width], [0, fy * h / height, cy * h / height], [0, 0, 1.0]])
+    K = np.array(
+        [[fx * w / width, 0, cx * w / width], [0, fy * h / height, cy * h / height], [0, 0, 1.0]]
+    )
     return Geometry(K, w, h, factor)
 
 
 def positions(camera: Camera, view: Geometry) -> np.ndarray:
     """Where the centres of a view's pixels lie in its photo: f64 [2, H, W] (x, y) in photo pixels.
 
-    Choices: beyond the radius at which a distortion polynomial turns back, the photo has no such pixel: -1.
+    Choices: beyond the radius at which a distortion polynomial turns back, the photo has no such
+      pixel: -1.
     """
     if camera.model not in DISTORTED:
         x = (np.arange(view.width) + 0.5) * camera.width / view.width
@@ -264,15 +352,17 @@ def positions(camera: Camera, view: Geometry) -> np.ndarray:
     found = camera.colmap.img_from_cam(pixels @ (camera.turned @ np.linalg.inv(view.K)).T)
     at = np.asarray(found, float).T.reshape(2, view.height, view.width)
     (x_down, x_right), (y_down, y_right) = (np.gradient(side) for side in at)
-    plain = (x_right > 0) & (y_down > 0) & (x_right * y_down > x_down * y_right)  # not where at is nan
+    plain = (
+        (x_right > 0) & (y_down > 0) & (x_right * y_down > x_down * y_right)
+    )  # not where at is nan
     return np.where(plain, at, -1.0)
 
 
 def read_view(
     frame: Frame, listing: Listing, view: Geometry, at: np.ndarray, wanted: set[str]
 ) -> dict[str, np.ndarray]:
-    """images u8 [H, W, 3], loss_mask, opaque bool [H, W]; where `wanted`, depth, labels, pseudo_labels, confidence
-    [H, W].
+    """images u8 [H, W, 3], loss_mask, opaque bool [H, W]; where `wanted`, depth, labels,
+    pseudo_labels, confidence [H, W].
     """
     camera, size = frame.camera, (frame.camera.width, frame.camera.height)
     inside = within(at, size)
@@ -293,14 +383,22 @@ def read_view(
         known = within(place, field) & inside & ~np.isin(stored, listing.no_depth)
         if frame.sureness is not None:
             known &= companion(frame.sureness, field, place) > 0
-        fields["depth"] = np.where(known, stored / np.float32(listing.depth_scale), np.float32(np.nan))
+        fields["depth"] = np.where(
+            known, stored / np.float32(listing.depth_scale), np.float32(np.nan)
+        )
     if "labels" in wanted and frame.labels is not None:
         fields["labels"] = np.where(inside, labels.read(frame, listing, size, at), np.int32(-1))
-    if "pseudo_labels" in wanted and frame.pseudo_labels is not None and frame.confidence is not None:
+    if (
+        "pseudo_labels" in wanted
+        and frame.pseudo_labels is not None
+        and frame.confidence is not None
+    ):
         ids = companion(frame.pseudo_labels, size, at, GREY, "8- or 16-bit ids")
         fields["pseudo_labels"] = np.where(inside, ids.astype(np.int32), np.int32(0))
         sure = nearest(confidences(frame.confidence), at, size)
-        fields["confidence"] = np.where(inside & (fields["pseudo_labels"] > 0), sure, 0).astype(np.float16)
+        fields["confidence"] = np.where(inside & (fields["pseudo_labels"] > 0), sure, 0).astype(
+            np.float16
+        )
     return fields
 
 
@@ -323,8 +421,12 @@ def from_beside(path: Path, listing: Listing, view: Geometry) -> np.ndarray:
     return depth
 
 
-def photo(frame: Frame, listing: Listing, view: Geometry, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The view's pixels u8 [H, W, 3] and where they are opaque, bool [H, W]; the whole photo is gone on return."""
+def photo(
+    frame: Frame, listing: Listing, view: Geometry, at: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The view's pixels u8 [H, W, 3] and where they are opaque, bool [H, W]; the whole photo is
+    gone on return.
+    """
     size = (frame.camera.width, frame.camera.height)
     with open_photo(frame.image, size, listing.upright) as (image, opaque):
         seen = np.ones(at.shape[1:], bool) if opaque is None else nearest(opaque, at, size)
@@ -332,8 +434,8 @@ def photo(frame: Frame, listing: Listing, view: Geometry, at: np.ndarray) -> tup
 
 
 def variance_kept(image: Any, pixels: np.ndarray, at: np.ndarray) -> float:
-    """Variance of a view's grey values u8 [H, W, 3] in that of the part of its photo which it shows, at most 1: what
-    is finer than its pixels is lost.
+    """Variance of a view's grey values u8 [H, W, 3] in that of the part of its photo which it
+    shows, at most 1: what is finer than its pixels is lost.
 
     Args: at [2, H, W]: where the view's pixels lie in the photo.
     Choices: the part is the box about these pixels. A photo of one grey value keeps all.
@@ -342,7 +444,10 @@ def variance_kept(image: Any, pixels: np.ndarray, at: np.ndarray) -> float:
     low, high = np.nanmin(inside, (1, 2)), np.nanmax(inside, (1, 2))
     half = (high - low) / np.maximum(2 * np.array(at.shape[:0:-1]) - 2, 1)  # of a pixel of the view
     corners = np.clip([np.floor(low - half), np.ceil(high + half)], 0, image.size).astype(int)
-    part, view = image.convert("L").crop(corners.ravel().tolist()), Image.fromarray(pixels).convert("L")
+    part, view = (
+        image.convert("L").crop(corners.ravel().tolist()),
+        Image.fromarray(pixels).convert("L"),
+    )
     whole, shown = (ImageStat.Stat(of).var[0] for of in (part, view))
     return min(shown / whole, 1.0) if whole > 0 else 1.0
 
@@ -353,18 +458,23 @@ def within(at: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def moved(at: np.ndarray, camera: Camera, other: Camera) -> tuple[np.ndarray, tuple[int, int]]:
-    """Positions [2, H, W] of a pinhole camera in another at the same place, and the other's (width, height)."""
+    """Positions [2, H, W] of a pinhole camera in another at the same place, and the other's (width,
+    height).
+    """
     (fx, fy, cx, cy), (gx, gy, dx, dy) = camera.pinhole, other.pinhole
     place = np.stack([(at[0] - cx) * (gx / fx) + dx, (at[1] - cy) * (gy / fy) + dy])
     return place, (other.width, other.height)
 
 
 def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.ndarray:
-    """The RGB photo as u8 [H, W, 3] of the view: area averages, where the photo is distorted of its undistorted self.
+    """The RGB photo as u8 [H, W, 3] of the view: area averages, where the photo is distorted of its
+    undistorted self.
 
-    Choices: a distorted photo is interpolated, by cubic splines, where it is at least twice as fine as the view:
-      reduced no further, or doubled by its cosine series, which adds and loses nothing. A pixel is the mean of four
-      places in it, each with its share of the area; where pixels are as large as the photo's, the value at its middle.
+    Choices: a distorted photo is interpolated, by cubic splines, where it is at least twice as fine
+      as the view: reduced no further, or doubled by its cosine series, which adds and loses
+        nothing. A pixel is the mean of four
+      places in it, each with its share of the area; where pixels are as large as the photo's, the
+      value at its middle.
     """
     if camera.model not in DISTORTED:
         size = (view.width, view.height)
@@ -372,14 +482,18 @@ def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.
 
     scale = min(2 * view.factor, 1.0)
     size = (max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
-    small = np.asarray(image if size == image.size else image.resize(size, Image.Resampling.BOX), np.float32)
+    small = np.asarray(
+        image if size == image.size else image.resize(size, Image.Resampling.BOX), np.float32
+    )
     shape = [2 * side if scale == 1 else side for side in small.shape[:2]]
     spans = np.array([camera.height, camera.width])[:, None, None]
     places = (at[::-1] * (np.array(shape)[:, None, None] / spans) - 0.5)[:, None]
     if view.factor < 1:
         away = (1 - view.factor / scale) / 2  # pixels of the view
         down, right = (away * np.gradient(places[:, 0], axis=axis) for axis in (1, 2))
-        places = np.stack([places[:, 0] + i * down + j * right for i in (-1, 1) for j in (-1, 1)], 1)
+        places = np.stack(
+            [places[:, 0] + i * down + j * right for i in (-1, 1) for j in (-1, 1)], 1
+        )
     means = []
     for finer in np.moveaxis(small, -1, 0):  # one by one: a photo at twice its resolution is large
         if scale == 1:

@@ -22,21 +22,28 @@ MODELS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "O
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 EQUIRECTANGULAR = "EQUIRECTANGULAR"  # of a photo of all directions
 DISTORTED = tuple(name for name in MODELS if name not in PINHOLES)
-FACES = {"right-front": 45.0, "right-back": 135.0, "left-back": 225.0, "left-front": 315.0}  # degrees to the right
+# degrees to the right
+FACES = {"right-front": 45.0, "right-back": 135.0, "left-back": 225.0, "left-front": 315.0}
 TALL = 1.5  # heights of a face in its width: it sees 45° to either side, and 56° up and down
-ROTATION_TOLERANCE = 1e-2  # of RᵀR − I: rows written with three decimals pass, a scale of 1 % does not
+# of RᵀR − I: rows written with three decimals pass, a scale of 1 % does not
+ROTATION_TOLERANCE = 1e-2
 FOCAL = (0.01, 100.0)  # of the longer side: fields of view of 178 and of 0.6 degrees
 OFF_CENTRE = 1.5  # sides by which a principal point may lie off the middle: crops have it outside
-LEAST_BENT = 0.05  # pixels: a lens that moves none by more is not undone, which would cost detail and gain nothing
+# pixels: a lens that moves none by more is not undone, which would cost detail and gain nothing
+LEAST_BENT = 0.05
 LEAST_KEPT = 0.25  # of each side: a distortion that leaves less of a photo is none that a lens has
-SAME_SHAPE = 0.02  # difference in aspect ratio that still counts as another resolution of the same picture
+# difference in aspect ratio that still counts as another resolution of the same picture
+SAME_SHAPE = 0.02
 FARTHEST = 1e9  # scene units from the origin: in float64, points that far out are 1e-7 apart
-WIDEST = 1e6  # units of `formats.world`, between a camera and most others: in float32, points are 0.06 apart there
+# units of `formats.world`, between a camera and most others: in float32, points are 0.06 apart
+# there
+WIDEST = 1e6
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A COLMAP camera: model, its parameters in pixels with pixel centres at half integers, and the image's size.
+    """A COLMAP camera: model, its parameters in pixels with pixel centres at half integers, and the
+    image's size.
     turn: degrees to the right that a face of a photo of all directions looks.
     """
 
@@ -65,23 +72,31 @@ class Camera:
     def colmap(self) -> Any:
         import pycolmap
 
-        return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+        return pycolmap.Camera(
+            model=self.model, width=self.width, height=self.height, params=list(self.params)
+        )
 
 
 def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) -> Camera:
     """A camera that can be used. Raises InputError naming the file that describes it."""
     if model not in PINHOLES and model not in DISTORTED:
         raise InputError(
-            f"{origin}: camera model {model} is not supported ({', '.join([*PINHOLES, *DISTORTED])} are); "
+            f"{origin}: camera model {model} is not supported "
+            f"({', '.join([*PINHOLES, *DISTORTED])} are); "
             "make perspective images first, for example with `colmap image_undistorter`"
         )
     try:
-        camera = Camera(model, tuple(number(v) for v in params), int(number(width)), int(number(height)))
+        camera = Camera(
+            model, tuple(number(v) for v in params), int(number(width)), int(number(height))
+        )
     except (TypeError, ValueError) as error:
-        raise InputError(f"{origin}: camera size or parameters are no numbers ({error}); restore the file") from None
+        raise InputError(
+            f"{origin}: camera size or parameters are no numbers ({error}); restore the file"
+        ) from None
     if wrong := fault(camera):
         raise InputError(
-            f"{origin}: camera {model} {camera.width}x{camera.height} {camera.params} is not usable: {wrong}; "
+            f"{origin}: camera {model} {camera.width}x{camera.height} {camera.params} is not "
+            f"usable: {wrong}; "
             "restore the file"
         )
     if camera.model in DISTORTED and bend(camera) < LEAST_BENT:
@@ -91,14 +106,18 @@ def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) ->
 
 @functools.lru_cache(64)
 def bend(camera: Camera) -> float:
-    """Pixels by which a distorted camera moves a point of the photo at most, looked for on a grid; inf where that
-    cannot be told.
+    """Pixels by which a distorted camera moves a point of the photo at most, looked for on a grid;
+    inf where that cannot be told.
     """
     fx, fy, cx, cy = camera.pinhole
     x, y = np.meshgrid(np.linspace(0, camera.width, 33), np.linspace(0, camera.height, 33))
     pixels = np.stack([x, y], -1).reshape(-1, 2)
     rays = np.column_stack([(pixels - [cx, cy]) / [fx, fy], np.ones(len(pixels))])
-    return float(np.nan_to_num(np.abs(np.asarray(camera.colmap.img_from_cam(rays), float) - pixels), nan=np.inf).max())
+    return float(
+        np.nan_to_num(
+            np.abs(np.asarray(camera.colmap.img_from_cam(rays), float) - pixels), nan=np.inf
+        ).max()
+    )
 
 
 def fault(camera: Camera) -> str:
@@ -107,7 +126,9 @@ def fault(camera: Camera) -> str:
     if len(camera.params) != MODELS[camera.model]:
         return f"{len(camera.params)} parameters"
     if min(width, height) < 1 or max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
-        return f"a photo has 1 to {MAX_SIDE} pixels a side and at most {MAX_PIXELS // 10**6} million"
+        return (
+            f"a photo has 1 to {MAX_SIDE} pixels a side and at most {MAX_PIXELS // 10**6} million"
+        )
     fx, fy, cx, cy = camera.pinhole
     least, most = (share * max(width, height) for share in FOCAL)
     if not (least <= min(fx, fy) and max(fx, fy) <= most):
@@ -125,9 +146,11 @@ def fault(camera: Camera) -> str:
 
 
 def scaled(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The camera of a photo of (width, height) `size` that was made smaller or larger since the camera was written.
+    """The camera of a photo of (width, height) `size` that was made smaller or larger since the
+    camera was written.
 
-    Choices: it stays as it is where the photo has its size, either way up, or another shape, which is no such photo.
+    Choices: it stays as it is where the photo has its size, either way up, or another shape, which
+      is no such photo.
     """
     if (camera.width, camera.height) in (size, size[::-1]):
         return camera
@@ -135,7 +158,9 @@ def scaled(camera: Camera, size: tuple[int, int]) -> Camera:
         if abs(width * camera.height / (height * camera.width) - 1) < SAME_SHAPE:
             held = camera.colmap
             held.rescale(width, height)
-            return replace(camera, params=tuple(float(v) for v in held.params), width=width, height=height)
+            return replace(
+                camera, params=tuple(float(v) for v in held.params), width=width, height=height
+            )
     return camera
 
 
@@ -143,8 +168,8 @@ def scaled(camera: Camera, size: tuple[int, int]) -> Camera:
 def undistorted(camera: Camera) -> Camera:
     """The pinhole camera of the largest view without blank pixels; pinhole cameras as they are.
 
-    Choices: focal lengths stay, and the principal point stays where it is in its pixel, so that where the lens bends
-      little the view's pixels are the photo's.
+    Choices: focal lengths stay, and the principal point stays where it is in its pixel, so that
+      where the lens bends little the view's pixels are the photo's.
     """
     if camera.model not in DISTORTED:
         return Camera("PINHOLE", camera.pinhole, camera.width, camera.height)
@@ -163,20 +188,28 @@ def undistorted(camera: Camera) -> Camera:
 
 
 def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -> np.ndarray:
-    """Inverse [V, 4, 4] of rigid camera-to-world matrices [V, 4, 4]; nan where one holds inf or nan.
+    """Inverse [V, 4, 4] of rigid camera-to-world matrices [V, 4, 4]; nan where one holds inf or
+    nan.
 
-    Raises:  InputError naming the first frame whose matrix is scaled, mirrored, sheared or projective, or far away.
+    Raises:  InputError naming the first frame whose matrix is scaled, mirrored, sheared or
+      projective, or far away.
     Choices: the rounding of a text file is removed by taking the nearest rotation (SVD).
     """
     usable = np.isfinite(world_from_cam).all((1, 2))
     rotations = np.where(usable[:, None, None], world_from_cam[:, :3, :3], np.eye(3))
-    with np.errstate(over="ignore", invalid="ignore"):  # of entries like 1e300, which no rotation has
+    # of entries like 1e300, which no rotation has
+    with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(rotations.transpose(0, 2, 1) @ rotations - np.eye(3)).max((1, 2))
         last = np.abs(world_from_cam[:, 3] - [0, 0, 0, 1]).max(1, where=usable[:, None], initial=0)
-        rigid = (error < ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0) & (last < ROTATION_TOLERANCE)
+        rigid = (
+            (error < ROTATION_TOLERANCE)
+            & (np.linalg.det(rotations) > 0)
+            & (last < ROTATION_TOLERANCE)
+        )
     if not rigid.all():
         raise InputError(
-            f"{origin}: the pose of {names[int(np.argmin(rigid))]} is not a rotation and a translation; "
+            f"{origin}: the pose of {names[int(np.argmin(rigid))]} is not a rotation and a "
+            "translation; "
             "write poses without scale, shear or mirroring"
         )
     near(origin, world_from_cam[:, :3, 3], names)
@@ -184,18 +217,23 @@ def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -
     inverse = (left @ right).transpose(0, 2, 1)
     poses = np.tile(np.eye(4), (len(rotations), 1, 1))
     poses[:, :3, :3] = inverse
-    poses[usable, :3, 3] = -np.einsum("vij,vj->vi", inverse, np.nan_to_num(world_from_cam[:, :3, 3]))[usable]
+    poses[usable, :3, 3] = -np.einsum(
+        "vij,vj->vi", inverse, np.nan_to_num(world_from_cam[:, :3, 3])
+    )[usable]
     poses[~usable] = np.nan
     return poses
 
 
 def near(origin: Path, places: np.ndarray, names: list[str]) -> None:
-    """Raise InputError if one of some cameras' places [V, 3] is beyond FARTHEST, or so far from most of them that no
-    scene can hold both; nan is left to `chosen`.
+    """Raise InputError if one of some cameras' places [V, 3] is beyond FARTHEST, or so far from
+    most of them that no scene can hold both; nan is left to `chosen`.
     """
-    reach, inside = (np.abs(where).max(1, initial=0) for where in (places, World.of(places).inward(places)))
+    reach, inside = (
+        np.abs(where).max(1, initial=0) for where in (places, World.of(places).inward(places))
+    )
     for k in np.flatnonzero(np.isfinite(reach) & ((reach > FARTHEST) | (inside > WIDEST))):
         raise InputError(
-            f"{origin}: {names[k]} lies {reach[k]:.3g} units from the origin, too far to be told from the others "
+            f"{origin}: {names[k]} lies {reach[k]:.3g} units from the origin, too far to be told "
+            "from the others "
             "or to be seen beside them; correct its pose, or move the scene's origin into the scene"
         )

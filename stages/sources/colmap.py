@@ -1,4 +1,6 @@
-"""The COLMAP source: images/ and models in sparse/, with depth/, label maps and masks/ where they are given."""
+"""The COLMAP source: images/ and models in sparse/, with depth/, label maps and masks/ where they
+are given.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,10 @@ from chebsplat.stages.sources import assembly, cameras, common, labels, texts
 from chebsplat.stages.sources.colmap_model import Cloud, Model, read_model, size_of
 from chebsplat.stages.sources.common import Frame, Listing
 
-HELP = "correct source.path; a COLMAP source holds images/ and sparse/0/{cameras,images,points3D}.bin or .txt"
+HELP = (
+    "correct source.path; a COLMAP source holds images/ and "
+    "sparse/0/{cameras,images,points3D}.bin or .txt"
+)
 FEW = 10**6  # more than any test_every
 MIN_TRACK = 3  # images that see a point: two can agree by chance
 MAX_ERROR = 4.0  # pixels, of a point's mean reprojection error
@@ -27,16 +32,18 @@ LEAST = 100  # good points; a model with fewer is one whose points somebody has 
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
     """The fields of a capture; `is_test` too, if scene.json says which views are.
 
-    Choices: scene.json's split counts all of its frames, so `max_views` never moves a view from one side to the
-      other; if it leaves one side empty, the split is not given and a note says so. The model's points are taken
-      unless there is depth, which gives more and is held against them (`landmarks`); of those with tracks the ones
-      that fewer than MIN_TRACK images see, or that are known to lie farther than MAX_ERROR pixels off on average, are
-      left out.
+    Choices: scene.json's split counts all of its frames, so `max_views` never moves a view from one
+      side to the other; if it leaves one side empty, the split is not given and a note says so. The
+      model's points are taken unless there is depth, which gives more and is held against them
+      (`landmarks`); of those with tracks the ones that fewer than MIN_TRACK images see, or that are
+      known to lie farther than MAX_ERROR pixels off on average, are left out.
     """
     listing, model = _listing(folder)
     fields = assembly.assemble(listing, settings, class_names)
     lost = assembly.in_empty_space(model.cloud.means, fields, listing)
-    shown = points_of(model.cloud, [common.stem(image.name) for image in model.images], fields, lost)
+    shown = points_of(
+        model.cloud, [common.stem(image.name) for image in model.images], fields, lost
+    )
     if "depth" in fields and settings.depth == "auto":
         fields["landmarks"] = shown
     else:
@@ -48,31 +55,55 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """Light: reads names only. Depth of one view is a promise: `read` fails if another view of the model has none."""
-    return {"poses": True, "depth": any(_pngs(folder / "depth")), "labels": labels.place_in(folder) is not None}
+    """Light: reads names only. Depth of one view is a promise: `read` fails if another view of the
+    model has none.
+    """
+    return {
+        "poses": True,
+        "depth": any(_pngs(folder / "depth")),
+        "labels": labels.place_in(folder) is not None,
+    }
 
 
 def files(folder: Path) -> list[Path]:
     """The model, scene.json, labels.json, and every image, depth, label map and mask."""
-    model = [path for place in _models(folder) for path in place.iterdir() if path.suffix in (".bin", ".txt")]
+    model = [
+        path
+        for place in _models(folder)
+        for path in place.iterdir()
+        if path.suffix in (".bin", ".txt")
+    ]
     documents = [folder / name for name in labels.DOCUMENTS if common.present(folder / name)]
-    places = [common.photo_folder(folder), *(folder / name for name in ("depth", "masks", "confidence"))]
+    places = [
+        common.photo_folder(folder),
+        *(folder / name for name in ("depth", "masks", "confidence")),
+    ]
     data = [place / name for place in places for name in common.names_below(place)]
     return sorted([*model, *documents, *data, *labels.files(folder)])
 
 
 def _pngs(folder: Path) -> Iterator[tuple[str, Path]]:
     """PNGs below a folder, by the name of the view that they belong to."""
-    return ((name[:-4], folder / name) for name in common.names_below(folder) if name.lower().endswith(".png"))
+    return (
+        (name[:-4], folder / name)
+        for name in common.names_below(folder)
+        if name.lower().endswith(".png")
+    )
 
 
 def _models(folder: Path) -> list[Path]:
-    """The folders of all models: sparse/0 and its neighbours, sparse/ itself, and where nerfstudio puts them."""
+    """The folders of all models: sparse/0 and its neighbours, sparse/ itself, and where nerfstudio
+    puts them.
+    """
     roots = [root for root in (folder / "sparse", folder / "colmap/sparse") if root.is_dir()]
     places = [place for root in roots for place in (*sorted(root.iterdir(), key=_natural), root)]
-    found = [p for p in places if any(common.present(p / f"cameras.{end}") for end in ("bin", "txt"))]
+    found = [
+        p for p in places if any(common.present(p / f"cameras.{end}") for end in ("bin", "txt"))
+    ]
     if not found:
-        raise InputError(f"{folder / 'sparse/0'} holds no COLMAP model (cameras.bin or cameras.txt); {HELP}")
+        raise InputError(
+            f"{folder / 'sparse/0'} holds no COLMAP model (cameras.bin or cameras.txt); {HELP}"
+        )
     return found
 
 
@@ -81,13 +112,18 @@ def _natural(path: Path) -> Any:
 
 
 def _model_folder(folder: Path) -> tuple[Path, list[str]]:
-    """The model with the most images, the first of equals; a note that names the others, if there are any."""
+    """The model with the most images, the first of equals; a note that names the others, if there
+    are any.
+    """
     places = _models(folder)
     if len(places) == 1:
         return places[0], []
     sizes = [size_of(place) for place in places]
     best = sizes.index(max(sizes))
-    told = [f"{place.relative_to(folder)} ({size} images)" for place, size in zip(places, sizes, strict=True)]
+    told = [
+        f"{place.relative_to(folder)} ({size} images)"
+        for place, size in zip(places, sizes, strict=True)
+    ]
     others = ", ".join(told[:best] + told[best + 1 :])
     return places[best], [f"The largest model is taken, {told[best]}; left out: {others}."]
 
@@ -98,7 +134,9 @@ def _document(folder: Path) -> dict[str, Any]:
 
 
 def _split(folder: Path, names: list[str]) -> set[str] | None:
-    """Names of the test views: every `test_every`-th frame of scene.json, from its first on; None if it has no say."""
+    """Names of the test views: every `test_every`-th frame of scene.json, from its first on; None
+    if it has no say.
+    """
     document = _document(folder)
     if "test_every" not in document:
         return None
@@ -107,7 +145,8 @@ def _split(folder: Path, names: list[str]) -> set[str] | None:
         listed = [common.stem(frame["file"]) for frame in document.get("frames", [])]
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{folder / 'scene.json'}: test_every or the frames' files are not usable ({error}); restore it"
+            f"{folder / 'scene.json'}: test_every or the frames' files are not usable ({error}); "
+            "restore it"
         ) from None
     return set((listed or sorted(names, key=common.natural))[::every])
 
@@ -115,9 +154,11 @@ def _split(folder: Path, names: list[str]) -> set[str] | None:
 def points_of(
     cloud: Cloud, images: list[str], fields: dict[str, Any], lost: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """points, point_colors and tracks (point, view) of a capture of these fields; nothing of few points.
+    """points, point_colors and tracks (point, view) of a capture of these fields; nothing of few
+    points.
 
-    Args:    images: names of the views that the cloud's tracks count; lost: points that are left out.
+    Args:    images: names of the views that the cloud's tracks count; lost: points that are left
+      out.
     Choices: a point whose error is not known is taken.
     """
     names, notes = fields["names"], fields["source"]["notes"]
@@ -128,18 +169,25 @@ def points_of(
         good &= (length >= MIN_TRACK) & ~(cloud.errors > MAX_ERROR)
     if not good.all():
         notes.append(
-            f"{len(good) - good.sum()} of the model's {len(good)} points are left out: fewer than {MIN_TRACK} images "
+            f"{len(good) - good.sum()} of the model's {len(good)} points are left out: fewer than "
+            f"{MIN_TRACK} images "
             f"see them, or they lie more than {MAX_ERROR:g} pixels off."
         )
     good &= True if lost is None else ~lost
     if good.sum() < LEAST:
         if len(good):
-            notes.append(f"{good.sum()} points are left, fewer than {LEAST}: none is used, and photos are matched.")
+            notes.append(
+                f"{good.sum()} points are left, fewer than {LEAST}: none is used, and "
+                "photos are matched."
+            )
         return {}
     view = {name: row for row, name in enumerate(names)}
-    of_image = np.array([[view.get(each, -1) for each in (name, *assembly.face_names(name))] for name in images])
+    of_image = np.array(
+        [[view.get(each, -1) for each in (name, *assembly.face_names(name))] for name in images]
+    )
     of_point = np.where(good, np.cumsum(good) - 1, -1)
-    rows = of_image.reshape(len(images), -1)[cloud.tracks[:, 1]]  # of each track, of which one sees the point
+    # of each track, of which one sees the point
+    rows = of_image.reshape(len(images), -1)[cloud.tracks[:, 1]]
     ahead = np.concatenate([fields["cam_from_world"][:, 2], np.zeros((1, 4))])[rows]
     depth = np.einsum("trk,tk->tr", ahead[..., :3], cloud.means[cloud.tracks[:, 0]]) + ahead[..., 3]
     seen = np.take_along_axis(rows, np.where(rows < 0, -np.inf, depth).argmax(1)[:, None], 1)[:, 0]
@@ -152,11 +200,18 @@ def points_of(
 
 
 def _listing(folder: Path) -> tuple[Listing, Model]:
-    """The frames, and the model with its images called by their files; those that are absent have no name."""
+    """The frames, and the model with its images called by their files; those that are absent have
+    no name.
+    """
     place, notes = _model_folder(folder)
     images = common.photo_folder(folder)
-    if not images.is_dir() and (undistorted := sorted(path.parent for path in folder.glob("dense/**/images"))):
-        raise InputError(f"{images} is missing; {undistorted[0]} holds undistorted images and their model: name that")
+    if not images.is_dir() and (
+        undistorted := sorted(path.parent for path in folder.glob("dense/**/images"))
+    ):
+        raise InputError(
+            f"{images} is missing; {undistorted[0]} holds undistorted images and "
+            "their model: name that"
+        )
     model = read_model(place)
     notes += model.notes
     on_disk, wanted = common.images_in(images), [image.name for image in model.images]
@@ -170,20 +225,39 @@ def _listing(folder: Path) -> tuple[Listing, Model]:
             camera = cameras.camera_of(model.origin, *model.cameras[image.camera])
             depth = pngs.get(name, folder / f"depth/{name}.png") if pngs else None
             sure = common.sureness(depth) if depth else None
-            frames.append(Frame(name, images / file, camera, image.pose, depth, sureness=sure, mask=masks.get(file)))
+            frames.append(
+                Frame(
+                    name,
+                    images / file,
+                    camera,
+                    image.pose,
+                    depth,
+                    sureness=sure,
+                    mask=masks.get(file),
+                )
+            )
     rest = set(on_disk) - set(files.values())
     absent = [name for name in wanted if name not in files]
     if absent:
-        notes.append(f"{len(absent)} of {len(wanted)} images of the model are absent on disk ({few(absent)}).")
+        notes.append(
+            f"{len(absent)} of {len(wanted)} images of the model are absent on disk "
+            f"({few(absent)})."
+        )
     if rest:
         notes.append(
-            f"{len(rest)} of {len(on_disk)} images on disk are not in the model and are left out ({few(rest)})."
+            f"{len(rest)} of {len(on_disk)} images on disk are not in the model and are left out "
+            f"({few(rest)})."
         )
     if by_stem := sum(name != file for name, file in files.items()):
-        notes.append(f"{by_stem} of the model's images have another path on disk and are told by their names.")
+        notes.append(
+            f"{by_stem} of the model's images have another path on disk and are told by "
+            "their names."
+        )
     if images.name != "images":
         notes.append(f"Photos are those of {images.name}/.")
-    model = replace(model, images=[replace(image, name=files.get(image.name, "")) for image in model.images])
+    model = replace(
+        model, images=[replace(image, name=files.get(image.name, "")) for image in model.images]
+    )
     listing = Listing("colmap", frames, notes=notes + unmasked)
     labels.give(listing, folder)
     return listing, model

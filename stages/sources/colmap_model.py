@@ -1,7 +1,8 @@
-"""COLMAP's models, binary and text: cameras, posed images and points, read by their documented layout.
+"""COLMAP's models, binary and text: cameras, posed images and points, read by their documented
+layout.
 
-They are read here and not by pycolmap, which loops for ever over a file that is cut in the middle of a record, and
-takes all memory for a name without an end.
+They are read here and not by pycolmap, which loops for ever over a file that is cut in the middle
+of a record, and takes all memory for a name without an end.
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """A model's points: means f64 [N, 3], colors u8 [N, 3], errors f64 [N] pixels; tracks i64 [T, 2]: (point's row,
-    position in the model's images).
+    """A model's points: means f64 [N, 3], colors u8 [N, 3], errors f64 [N] pixels; tracks i64 [T,
+    2]: (point's row, position in the model's images).
     """
 
     means: np.ndarray
@@ -48,7 +49,8 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """origin: the cameras' file; cameras: (model, parameters, width, height) by id; images in the file's order;
+    """origin: the cameras' file; cameras: (model, parameters, width, height) by id; images in the
+    file's order;
     notes: what of the files was not read.
     """
 
@@ -60,7 +62,9 @@ class Model:
 
 
 def size_of(place: Path) -> int:
-    """How many images the model in a folder has, by what its files say; 0 of what cannot be read."""
+    """How many images the model in a folder has, by what its files say; 0 of what cannot be
+    read.
+    """
     try:
         if common.present(place / "images.bin"):
             regular(place / "images.bin")
@@ -72,7 +76,9 @@ def size_of(place: Path) -> int:
 
 
 def read_model(place: Path) -> Model:
-    """The model in a folder. Raises InputError naming the file that is cut, inconsistent or no model's."""
+    """The model in a folder. Raises InputError naming the file that is cut, inconsistent or no
+    model's.
+    """
     end = "bin" if common.present(place / "cameras.bin") else "txt"
     paths = [place / f"{name}.{end}" for name in ("cameras", "images", "points3D")]
     for path in paths:
@@ -86,14 +92,23 @@ def read_model(place: Path) -> Model:
         try:
             found.append(list(entries(path, notes)))
         except (ValueError, IndexError, OverflowError, struct.error) as error:
-            raise InputError(f"{path} is cut or no COLMAP model ({str(error)[:LONGEST]}); {AGAIN}") from None
+            raise InputError(
+                f"{path} is cut or no COLMAP model ({str(error)[:LONGEST]}); {AGAIN}"
+            ) from None
     known = dict(found[0])
     images = []
     for _, name, camera, quaternion, translation in found[1]:
         if camera not in known:
-            raise InputError(f"{paths[1]}: {name[:LONGEST]!r} is of camera {camera}, which is not listed; {AGAIN}")
+            raise InputError(
+                f"{paths[1]}: {name[:LONGEST]!r} is of camera {camera}, which is not "
+                f"listed; {AGAIN}"
+            )
         images.append(Image(name, camera, _pose(paths[1], name, quaternion, translation)))
-    cameras.near(paths[1], np.array([image.pose[:3, 3] for image in images]).reshape(-1, 3), [i.name for i in images])
+    cameras.near(
+        paths[1],
+        np.array([image.pose[:3, 3] for image in images]).reshape(-1, 3),
+        [i.name for i in images],
+    )
     position = {key: row for row, (key, *_) in enumerate(found[1])}
     return Model(paths[0], known, images, _cloud(paths[2], found[2], position), tuple(notes))
 
@@ -101,12 +116,19 @@ def read_model(place: Path) -> Model:
 def _cloud(path: Path, entries: list[Any], position: dict[int, int]) -> Cloud:
     """Points from (x, y, z, red, green, blue, error) and the ids of the images that see each.
 
-    Choices: an image that is not listed is passed over: scripts that thin out a model leave its points as they are.
+    Choices: an image that is not listed is passed over: scripts that thin out a model leave its
+      points as they are.
     """
     values = np.array([entry[0] for entry in entries], float).reshape(-1, 7)
     seen = [np.asarray(entry[1], np.int64) for entry in entries]
-    ids, row = np.concatenate([*seen, np.zeros(0, np.int64)]), np.repeat(np.arange(len(seen)), [*map(len, seen)])
-    if not np.isfinite(values[:, :6]).all() or ((values[:, 3:6] < 0) | (values[:, 3:6] > 255)).any():
+    ids, row = (
+        np.concatenate([*seen, np.zeros(0, np.int64)]),
+        np.repeat(np.arange(len(seen)), [*map(len, seen)]),
+    )
+    if (
+        not np.isfinite(values[:, :6]).all()
+        or ((values[:, 3:6] < 0) | (values[:, 3:6] > 255)).any()
+    ):
         raise InputError(f"{path}: a point's place or colour is no such; {AGAIN}")
     views = np.array([position.get(key, -1) for key in ids.tolist()], np.int64)
     tracks = np.unique(np.stack([row, views], 1)[views >= 0], axis=0)
@@ -116,12 +138,15 @@ def _cloud(path: Path, entries: list[Any], position: dict[int, int]) -> Cloud:
 def _pose(path: Path, name: str, quaternion: Any, translation: Any) -> np.ndarray:
     """cam_from_world [4, 4] of a quaternion (w, x, y, z) and a translation.
 
-    Choices: a quaternion of unit length is taken as it is, as COLMAP does; one of few decimals is normalised.
+    Choices: a quaternion of unit length is taken as it is, as COLMAP does; one of few decimals is
+      normalised.
     """
     q, t = np.array(quaternion, float), np.array(translation, float)
     off = abs(math.hypot(*q) - 1)
     if not (off < SHORT and np.isfinite(t).all()):
-        raise InputError(f"{path}: the pose of {name[:LONGEST]!r} is no rotation and translation; {AGAIN}")
+        raise InputError(
+            f"{path}: the pose of {name[:LONGEST]!r} is no rotation and translation; {AGAIN}"
+        )
     w, x, y, z = q if off < 1e-9 else q / math.hypot(*q)
     pose = np.eye(4)
     pose[:3, :3] = [
@@ -134,7 +159,9 @@ def _pose(path: Path, name: str, quaternion: Any, translation: Any) -> np.ndarra
 
 
 class _Bytes:
-    """A binary file from its first byte on; ends in ValueError where a record would pass the last one."""
+    """A binary file from its first byte on; ends in ValueError where a record would pass the last
+    one.
+    """
 
     def __init__(self, path: Path):
         if regular(path).st_size > LARGEST:
@@ -167,13 +194,19 @@ class _Bytes:
     def end(self, notes: list[str]) -> None:
         """Note bytes beyond the last record, which COLMAP passes over, too."""
         if rest := len(self.data) - self.at:
-            notes.append(f"{rest} bytes follow the last record of {self.path.name} and are not read.")
+            notes.append(
+                f"{rest} bytes follow the last record of {self.path.name} and are not read."
+            )
 
 
-_COUNT, _CAMERA, _IMAGE, _POINT = (struct.Struct(f"<{layout}") for layout in ("Q", "IiQQ", "I4d3dI", "Q3d3BdQ"))
+_COUNT, _CAMERA, _IMAGE, _POINT = (
+    struct.Struct(f"<{layout}") for layout in ("Q", "IiQQ", "I4d3dI", "Q3d3BdQ")
+)
 
 
-def _binary_cameras(path: Path, notes: list[str]) -> Iterator[tuple[int, tuple[str, tuple[float, ...], int, int]]]:
+def _binary_cameras(
+    path: Path, notes: list[str]
+) -> Iterator[tuple[int, tuple[str, tuple[float, ...], int, int]]]:
     data = _Bytes(path)
     for _ in data.count(_CAMERA.size):
         key, kind, width, height = data.take(_CAMERA)
@@ -221,17 +254,25 @@ def _whole(word: str) -> int:
     return int(value)
 
 
-def _text_cameras(path: Path, notes: list[str]) -> Iterator[tuple[int, tuple[str, tuple[float, ...], int, int]]]:
+def _text_cameras(
+    path: Path, notes: list[str]
+) -> Iterator[tuple[int, tuple[str, tuple[float, ...], int, int]]]:
     for _, line in _lines(path):
         if words := line.split():
-            yield _whole(words[0]), (words[1], tuple(map(float, words[4:])), _whole(words[2]), _whole(words[3]))
+            yield (
+                _whole(words[0]),
+                (words[1], tuple(map(float, words[4:])), _whole(words[2]), _whole(words[3])),
+            )
 
 
-def _text_images(path: Path, notes: list[str]) -> Iterator[tuple[int, str, int, list[float], list[float]]]:
+def _text_images(
+    path: Path, notes: list[str]
+) -> Iterator[tuple[int, str, int, list[float], list[float]]]:
     """Images, each followed by a line of its keypoints.
 
-    Choices: the line after an image lists its keypoints if it is empty or of numbers alone, three each; scripts that
-      thin out a model leave it away, and a line that reads as an image is one. Anything else is refused.
+    Choices: the line after an image lists its keypoints if it is empty or of numbers alone, three
+      each; scripts that thin out a model leave it away, and a line that reads as an image is one.
+      Anything else is refused.
     """
     follows = False
     for number, line in _lines(path):
@@ -245,7 +286,9 @@ def _text_images(path: Path, notes: list[str]) -> Iterator[tuple[int, str, int, 
             except (ValueError, IndexError):
                 entry = None
             if entry is None or (n is not None and abs(math.hypot(*values[:4]) - 1) > SHORT):
-                raise ValueError(f"line {number} is neither an image nor keypoints of three numbers each")
+                raise ValueError(
+                    f"line {number} is neither an image nor keypoints of three numbers each"
+                )
             follows = True
             yield entry
 

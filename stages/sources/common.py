@@ -1,4 +1,6 @@
-"""What every source on disk shares: frames as a listing, the files behind them, and which kind a folder is."""
+"""What every source on disk shares: frames as a listing, the files behind them, and which kind a
+folder is.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +24,36 @@ from chebsplat.stages.settings import SourceSection
 from chebsplat.stages.sources.cameras import Camera
 
 # where label maps lie; the first that is there is read
-LABELS = ("semantic", "semantics", "semantic_class", "label", "labels", "segmentation", "segmentations")
+LABELS = (
+    "semantic",
+    "semantics",
+    "semantic_class",
+    "label",
+    "labels",
+    "segmentation",
+    "segmentations",
+)
 # folders of what belongs to photos, or is made of them
-BESIDE = {"masks", "mask", "depth", "depths", "confidence", "instance", "normals", "thumbs", "thumbnails", *LABELS}
+BESIDE = {
+    "masks",
+    "mask",
+    "depth",
+    "depths",
+    "confidence",
+    "instance",
+    "normals",
+    "thumbs",
+    "thumbnails",
+    *LABELS,
+}
 LabelFile = Path | dict[str, Path]  # a view's map, or its masks by class
 ENDING = re.compile(r"\.[a-zA-Z]\w{1,4}$")  # of an image's name
 # What cameras leave beside photos, or instead of them, and what makes JPEGs of it.
 UNREAD = (
-    dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "darktable-cli a{0} a.jpg")
+    dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "darktable-cli a{0} "
+                                                                                    ""
+                                                                                    ""
+                                                                                    "a.jpg")
     | dict.fromkeys((".avif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".jp2", ".jxl", ".exr", ".psd"),
                     "magick a{0} a.jpg")
 )  # fmt: skip
@@ -37,7 +61,9 @@ UNREAD = (
 
 @dataclass
 class Frame:
-    """One photo and what belongs to it. pose: cam_from_world [4, 4], OpenCV axes, nan if unusable; None if unknown."""
+    """One photo and what belongs to it. pose: cam_from_world [4, 4], OpenCV axes, nan if unusable;
+    None if unknown.
+    """
 
     name: str
     image: Path
@@ -53,7 +79,8 @@ class Frame:
 
 
 class Shot(NamedTuple):
-    """A photo that comes alone. size: (width, height), upright; focal: 35 mm equivalent, where EXIF says one;
+    """A photo that comes alone. size: (width, height), upright; focal: 35 mm equivalent, where EXIF
+    says one;
     panorama: whether it shows all directions; frame: its number in a video.
     """
 
@@ -75,8 +102,10 @@ class Shot(NamedTuple):
 class Listing:
     """All frames of a source.
 
-    label_names:  by raw id; label_place: the folder of their maps; label_kinds: what these were taken for, by view,
-                  once they are read (`labels.read`). class_names: all classes in order; None: those that occur.
+    label_names:  by raw id; label_place: the folder of their maps; label_kinds: what these were
+      taken for, by view,
+                  once they are read (`labels.read`). class_names: all classes in order; None: those
+                    that occur.
     corrections:  object id -> raw id of the label that its pixels take instead.
     pseudo_names: by id in the pseudo labels; 0 is none.
     depth_scale:  stored units in one scene unit; no_depth: stored values that mean "unknown".
@@ -97,8 +126,10 @@ class Listing:
     depth_camera: Camera | None = None
     depth_offset: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
-    empty: dict[str, np.ndarray] = field(default_factory=dict)  # by view, where its photo is transparent, once read
-    upright: bool = False  # turn every image by its EXIF orientation; otherwise only where its camera asks for it
+    # by view, where its photo is transparent, once read
+    empty: dict[str, np.ndarray] = field(default_factory=dict)
+    # turn every image by its EXIF orientation; otherwise only where its camera asks for it
+    upright: bool = False
 
     def has(self, what: str) -> bool:
         """Whether every frame has a "pose", "depth", "labels" and so on."""
@@ -112,7 +143,9 @@ def sureness(depth: Path) -> Path | None:
 
 
 def file_of(view: int) -> str:
-    """The image of a view in the scratch folder: pycolmap's lists of pairs allow no name with a space."""
+    """The image of a view in the scratch folder: pycolmap's lists of pairs allow no name with a
+    space.
+    """
     return f"{view:06d}.png"
 
 
@@ -130,7 +163,9 @@ def distinct(named: Iterable[tuple[str, Path]]) -> None:
 
 
 def present(path: Path) -> bool:
-    """Whether there is anything of that name: a pipe or a dangling link is refused when it is read, not passed over."""
+    """Whether there is anything of that name: a pipe or a dangling link is refused when it is read,
+    not passed over.
+    """
     return os.path.lexists(path)
 
 
@@ -141,7 +176,9 @@ def nearest_file(folder: Path, name: str) -> Path | None:
 
 
 def detect(folder: Path) -> str:
-    """The kind of source that a folder, or a file of video, is. Raises InputError naming what was looked for."""
+    """The kind of source that a folder, or a file of video, is. Raises InputError naming what was
+    looked for.
+    """
     if any(present(folder / f"transforms{part}.json") for part in ("", "_train")):
         return "transforms"
     if any(present(folder / part) for part in ("traj.txt", "Sequence_1", "results")):
@@ -150,9 +187,15 @@ def detect(folder: Path) -> str:
         return "scannet"
     if (folder / "sparse").is_dir() or (folder / "colmap/sparse").is_dir():
         return "colmap"
-    if any(path.is_file() for place in ("", "seq-*/") for path in folder.glob(f"{place}frame-*.color.*")):
+    if any(
+        path.is_file()
+        for place in ("", "seq-*/")
+        for path in folder.glob(f"{place}frame-*.color.*")
+    ):
         return "seven_scenes"
-    if folder.is_dir() and (any(map(is_image, os.listdir(folder))) or any(names_below(photo_folder(folder)))):
+    if folder.is_dir() and (
+        any(map(is_image, os.listdir(folder))) or any(names_below(photo_folder(folder)))
+    ):
         return "photos"
     if is_video(folder.name) and folder.is_file():
         return "video"
@@ -162,21 +205,31 @@ def detect(folder: Path) -> str:
         return "photos"
     if (folder / "point_cloud").is_dir():
         raise InputError(
-            f"{folder} is a splat of 3DGS and no source: `chebsplat view` shows it, `chebsplat lift` takes it"
+            f"{folder} is a splat of 3DGS and no source: `chebsplat view` shows it, `chebsplat "
+            "lift` takes it"
         )
     if others := unread(folder):
         raise InputError(f"{folder} holds no .jpg, .png or .heic photo: {others}")
     raise InputError(
-        f"{folder} is no source: it holds neither transforms.json, traj.txt, results/, Sequence_1/, "
-        f"color/ with pose/ and intrinsic/, frame-*.color.jpg or .png, sparse/0/cameras.bin or .txt, "
+        f"{folder} is no source: it holds neither transforms.json, traj.txt, results/, "
+        "Sequence_1/, "
+        "color/ with pose/ and intrinsic/, frame-*.color.jpg or .png, sparse/0/cameras.bin or "
+        ".txt, "
         f"nor a .jpg, .png or .heic photo, nor one video"
     )
 
 
 def unread(folder: Path) -> str:
-    """What else a folder and its images/ hold that may be taken for photos, counted by suffix; nothing of none."""
+    """What else a folder and its images/ hold that may be taken for photos, counted by suffix;
+    nothing of none.
+    """
     places = [place for place in (folder, folder / "images") if place.is_dir()]
-    ends = [os.path.splitext(name)[1].lower() for place in places for name in os.listdir(place) if name[0] != "."]
+    ends = [
+        os.path.splitext(name)[1].lower()
+        for place in places
+        for name in os.listdir(place)
+        if name[0] != "."
+    ]
     counts = {end: n for end, n in sorted(Counter(ends).items()) if end in UNREAD or end in VIDEOS}
     if not counts:
         return ""
@@ -188,21 +241,29 @@ def unread(folder: Path) -> str:
 
 
 def names_below(folder: Path) -> Iterator[str]:
-    """Relative POSIX paths of the images below a folder, in no order; none if it does not exist. InputError.
+    """Relative POSIX paths of the images below a folder, in no order; none if it does not exist.
+    InputError.
 
     Choices: a folder that is called like an image counts as one, so that reading it says so.
     """
     for place, folders, names in os.walk(folder):
         inner = os.path.relpath(place, folder).replace(os.sep, "/")
         images = filter(is_image, [*folders, *names])
-        yield from printable(place, (name if inner == "." else f"{inner}/{name}" for name in images))
+        yield from printable(
+            place, (name if inner == "." else f"{inner}/{name}" for name in images)
+        )
 
 
 def printable(place: str | Path, names: Iterable[str]) -> Iterator[str]:
-    """Names of files, which become names of views. Raises InputError on bytes that are no UTF-8, and on newlines."""
+    """Names of files, which become names of views. Raises InputError on bytes that are no UTF-8,
+    and on newlines.
+    """
     for name in names:
         if unprintable(name):
-            raise InputError(f"{place}: the file name {name!a} holds bytes that cannot be printed; rename the file")
+            raise InputError(
+                f"{place}: the file name {name!a} holds bytes that cannot be "
+                "printed; rename the file"
+            )
         yield name
 
 
@@ -217,7 +278,9 @@ def images_in(folder: Path) -> list[str]:
 
 
 def photo_folder(folder: Path) -> Path:
-    """Where a source's photos lie: images/, or what 3DGS' converter reads, or a reduced copy that stands alone."""
+    """Where a source's photos lie: images/, or what 3DGS' converter reads, or a reduced copy that
+    stands alone.
+    """
     places = [folder / name for name in ("images", "input", "images_2", "images_4", "images_8")]
     return next((place for place in places if any(names_below(place))), places[0])
 
@@ -225,16 +288,24 @@ def photo_folder(folder: Path) -> Path:
 def with_photos(folder: Path) -> list[str]:
     """Subfolders that hold images, masks/ left out, in natural order."""
     with os.scandir(folder) as entries:
-        names = [entry.name for entry in entries if entry.is_dir() and entry.name[0] != "." and entry.name != "masks"]
-    return sorted((name for name in names if any(map(is_image, os.listdir(folder / name)))), key=natural)
+        names = [
+            entry.name
+            for entry in entries
+            if entry.is_dir() and entry.name[0] != "." and entry.name != "masks"
+        ]
+    return sorted(
+        (name for name in names if any(map(is_image, os.listdir(folder / name)))), key=natural
+    )
 
 
 def matched(wanted: Sequence[str], there: Collection[str]) -> dict[str, str]:
-    """The file that each of the names which a model holds means; names that mean none are left away.
+    """The file that each of the names which a model holds means; names that mean none are left
+    away.
 
     Args: there: POSIX paths of files below the folder that the names are relative to.
-    Choices: a name is a path with either separator. Where that is no file, endings are left away, and then folders, one
-      by one from the front, until it is one file's alone, and no other name's.
+    Choices: a name is a path with either separator. Where that is no file, endings are left away,
+      and then folders, one by one from the front, until it is one file's alone, and no other
+      name's.
     """
     files = set(there)
     found = {name: path for name in wanted if (path := name.replace("\\", "/")) in files}
@@ -253,12 +324,16 @@ def matched(wanted: Sequence[str], there: Collection[str]) -> dict[str, str]:
 
 
 def masks_in(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
-    """The masks of photos by the photos' names, in masks/ and called like a photo or its stem; a note if some lack."""
+    """The masks of photos by the photos' names, in masks/ and called like a photo or its stem; a
+    note if some lack.
+    """
     held = {stem(name): folder / "masks" / name for name in names_below(folder / "masks")}
     given = list(names)
     found = {name: path for name in given if (path := held.get(name) or held.get(stem(name)))}
     lacking = len(given) - len(found)
-    return found, [f"{lacking} of {len(given)} views have no mask; all their pixels count."] if held and lacking else []
+    return found, [
+        f"{lacking} of {len(given)} views have no mask; all their pixels count."
+    ] if held and lacking else []
 
 
 def spellings(name: str) -> tuple[str, str]:
@@ -268,14 +343,20 @@ def spellings(name: str) -> tuple[str, str]:
 
 
 def resolve_source(name: str, source: SourceSection) -> SourceSection:
-    """The source really meant: `named` is Replica's scene where REPLICA_ROOT holds it, else the generated one.
+    """The source really meant: `named` is Replica's scene where REPLICA_ROOT holds it, else the
+    generated one.
 
-    The result, not `named`, enters an artifact's key, so the two can never be mistaken for each other.
+    The result, not `named`, enters an artifact's key, so the two can never be mistaken for each
+    other.
     """
     if source.kind == "named":
         root = os.environ.get("REPLICA_ROOT")
         existing = [Path(root) / s for s in spellings(name) if root and (Path(root) / s).is_dir()]
-        change = {"kind": "replica", "path": str(existing[0])} if existing else {"kind": "generated", "path": None}
+        change = (
+            {"kind": "replica", "path": str(existing[0])}
+            if existing
+            else {"kind": "generated", "path": None}
+        )
         source = source.model_copy(update=change)
     if source.kind != "generated" and source.path is None:
         raise ConfigError(f"source.kind = {source.kind} needs source.path")

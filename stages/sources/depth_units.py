@@ -21,19 +21,26 @@ from chebsplat.errors import DataFailure
 N_PAIRS, N_PIXELS = 300, 20  # pairs of views whose depths are compared, and pixels of each
 NEAREST = 0.25  # of the views, among which the other of a pair is drawn: it should see the same
 N_POINTS = 100_000  # pairs of a point and a view that are looked at
-LEAST, COMPARED = 500, 0.1  # such pixels, without which nothing is said, and the share of them that a unit must compare
+# such pixels, without which nothing is said, and the share of them that a unit must compare
+LEAST, COMPARED = 500, 0.1
 SAME = 0.03  # of its depth, within which two depths agree
-FITS = 0.95  # of the share that agrees in the best unit: depth of which so many agree as it is stays so
-LEAST_SHARE, OVER_CHANCE = 0.25, 3.0  # that must agree in some unit; and their odds over those at the ends of all units
+# of the share that agrees in the best unit: depth of which so many agree as it is stays so
+FITS = 0.95
+# that must agree in some unit; and their odds over those at the ends of all units
+LEAST_SHARE, OVER_CHANCE = 0.25, 3.0
 BASELINES = 0.03, 100.0  # between the distances of cameras, how far what they see may lie
 DOUBTED = 0.5  # share below which a note says how many agree
 INVERSE = 1.1  # times the share that agrees in any unit, which inverse depth needs
-LEAST_RATIO = 0.4  # ln of far to near of inverse depth: less is a wall, whose depth any unit fits from afar
-FAR, HELD = 2.0, 1e-3  # times what the rest holds, and share of pixels, that make a value a code for unknown
+# ln of far to near of inverse depth: less is a wall, whose depth any unit fits from afar
+LEAST_RATIO = 0.4
+# times what the rest holds, and share of pixels, that make a value a code for unknown
+FAR, HELD = 2.0, 1e-3
 
 
 class Unit(NamedTuple):
-    """What stored depth v stands for: z = slope v, or, of inverse depth, 1 / z = slope v + shift; scene units."""
+    """What stored depth v stands for: z = slope v, or, of inverse depth, 1 / z = slope v + shift;
+    scene units.
+    """
 
     slope: float
     shift: float = 0.0
@@ -48,7 +55,9 @@ class Unit(NamedTuple):
 
 
 class Evidence(Protocol):
-    """Stored depths [N] that can be compared, and between which depths in scene units they must lie."""
+    """Stored depths [N] that can be compared, and between which depths in scene units they must
+    lie.
+    """
 
     stored: np.ndarray
     between: tuple[float, float]
@@ -60,7 +69,8 @@ class Evidence(Protocol):
 class AtPoints:
     """Depth at pixels where the source's points lie; those that are hidden there miss it.
 
-    Args: points [P, 3] scene units; tracks [T, 2] (point, view), who sees them; none: every view that has them inside.
+    Args: points [P, 3] scene units; tracks [T, 2] (point, view), who sees them; none: every view
+      that has them inside.
     """
 
     def __init__(self, fields: dict[str, Any], points: np.ndarray, tracks: np.ndarray) -> None:
@@ -69,7 +79,10 @@ class AtPoints:
         chosen = np.arange(count) if count <= N_POINTS else rng.integers(0, count, N_POINTS)
         point, view = tracks[chosen].T if len(tracks) else (chosen // n_views, chosen % n_views)
         poses = fields["cam_from_world"][view]
-        at = np.einsum("nij,nj->ni", poses[:, :3, :3], points[point].astype(np.float64)) + poses[:, :3, 3]
+        at = (
+            np.einsum("nij,nj->ni", poses[:, :3, :3], points[point].astype(np.float64))
+            + poses[:, :3, 3]
+        )
         pixels, inside = seen(at, fields["Ks"][view], (width, height))
         stored = fields["depth"][view[inside], pixels[:, 1], pixels[:, 0]]
         known = stored > 0  # nan is unknown
@@ -91,7 +104,10 @@ class BetweenViews:
         eyes, axes = centers(poses), poses[:, 2, :3]
         away = cdist(eyes, eyes)
         away = away / max(float(np.median(away)), 1e-30) + np.arccos((axes @ axes.T).clip(-1, 1))
-        one, rank = rng.integers(0, n_views, N_PAIRS), rng.integers(1, max(int(NEAREST * n_views), 4), N_PAIRS)
+        one, rank = (
+            rng.integers(0, n_views, N_PAIRS),
+            rng.integers(1, max(int(NEAREST * n_views), 4), N_PAIRS),
+        )
         two = np.argsort(away, axis=1)[one, rank % n_views]
         one, self.other = np.repeat([one, two], N_PIXELS, axis=1)
         column, row = (rng.integers(0, side, len(one)) for side in (width, height))
@@ -115,8 +131,8 @@ class BetweenViews:
 
 
 def seen(at: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels i64 [M, 2] (column, row) of those places [N, 3] of cameras [N, 3, 3] that lie in an image of this (width,
-    height), and which these are, bool [N].
+    """Pixels i64 [M, 2] (column, row) of those places [N, 3] of cameras [N, 3, 3] that lie in an
+    image of this (width, height), and which these are, bool [N].
     """
     image = np.einsum("nij,nj->ni", Ks, at)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -128,20 +144,29 @@ def seen(at: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> tuple[np.ndar
 def fit(fields: dict[str, Any], where: Path) -> None:
     """Bring the depth of a capture's fields into the unit of its poses, and say so in its notes.
 
-    Args: where: the source's folder. Fields: `landmarks`, points and tracks that the depth is held against and that go
-          no further, where the source has any; else its `points`; else the views' depths are held against one another.
+    Args: where: the source's folder. Fields: `landmarks`, points and tracks that the depth is held
+      against and that go
+          no further, where the source has any; else its `points`; else the views' depths are held
+          against one another.
     Raises:  DataFailure naming the folder where the depth fits in no unit.
-    Choices: shares of pixels that agree within SAME, of units between those that put what is seen nearer than cameras
-      are apart, and far beyond; the unit is then that of the least mean miss, cut off at a third of SAME. Depth is left
-      as it is where too few pixels can be compared, and where hardly more agree in any other unit. It fits in no unit
-      where no more agree than if all were far away, as walls do that look alike from there.
+    Choices: shares of pixels that agree within SAME, of units between those that put what is seen
+      nearer than cameras are apart, and far beyond; the unit is then that of the least mean miss,
+      cut off at a third of SAME. Depth is left as it is where too few pixels can be compared, and
+      where hardly more agree in any other unit. It fits in no unit where no more agree than if all
+      were far away, as walls do that look alike from there.
     """
     notes, landmarks = fields["source"]["notes"], fields.pop("landmarks", None)
-    notes += [f"Depth of {code:g} stands for unknown, in {share:.1%} of pixels." for code, share in codes(fields)]
+    notes += [
+        f"Depth of {code:g} stands for unknown, in {share:.1%} of pixels."
+        for code, share in codes(fields)
+    ]
     if fields.get("cam_from_world") is None:
         return
     evidence = evidence_of(fields, landmarks or fields)
-    if min(len(evidence.stored), np.isfinite(fields["depth"]).sum()) < LEAST or not evidence.between[0] > 0:
+    if (
+        min(len(evidence.stored), np.isfinite(fields["depth"]).sum()) < LEAST
+        or not evidence.between[0] > 0
+    ):
         return
     units = scales(evidence)
     shares = [agreeing(evidence, unit) for unit in units]
@@ -151,7 +176,8 @@ def fit(fields: dict[str, Any], where: Path) -> None:
     if as_it_is >= max(FITS * most, LEAST_SHARE):
         if as_it_is < DOUBTED:
             notes.append(
-                f"Only {as_it_is:.0%} of the depth's pixels agree with {against(evidence)} within {SAME:.0%}; "
+                f"Only {as_it_is:.0%} of the depth's pixels agree with {against(evidence)} within "
+                f"{SAME:.0%}; "
                 "ingest.depth=off leaves it out."
             )
         return
@@ -169,15 +195,18 @@ def fit(fields: dict[str, Any], where: Path) -> None:
     fields["depth"] = unit.depth(fields["depth"]).astype(np.float32)
     how = f"1 / ({unit.slope:.5g} d + {unit.shift:.5g})" if unit.inverse else f"{unit.slope:.5g} d"
     notes.append(
-        f"Depth d was in another unit than the poses and is taken as {how}: {share:.0%} of pixels agree with "
+        f"Depth d was in another unit than the poses and is taken as {how}: {share:.0%} of pixels "
+        "agree with "
         f"{against(evidence)} within {SAME:.0%}, {as_it_is:.0%} before."
     )
 
 
 def codes(fields: dict[str, Any]) -> list[tuple[float, float]]:
-    """Make depth nan where it holds a value that stands for unknown: each value, and its share of the pixels.
+    """Make depth nan where it holds a value that stands for unknown: each value, and its share of
+    the pixels.
 
-    Choices: single values that many pixels hold, far from what all others do: what is photographed hangs together.
+    Choices: single values that many pixels hold, far from what all others do: what is photographed
+      hangs together.
     """
     depth = fields["depth"]
     some = depth[:, ::2, ::2]
@@ -195,7 +224,9 @@ def codes(fields: dict[str, Any]) -> list[tuple[float, float]]:
 
 
 def evidence_of(fields: dict[str, Any], held: dict[str, Any]) -> Evidence:
-    """What the depth is held against: points where they tell enough, otherwise the views themselves."""
+    """What the depth is held against: points where they tell enough, otherwise the views
+    themselves.
+    """
     if held.get("points") is not None:
         tracks = held.get("tracks")
         at = AtPoints(fields, held["points"], np.zeros((0, 2), int) if tracks is None else tracks)
@@ -222,8 +253,8 @@ def scales(evidence: Evidence) -> list[Unit]:
 
 
 def inverses(evidence: Evidence) -> list[Unit]:
-    """Inverse depths whose near end lies between the same, in steps of 15 %, and whose far end is e^0.4 to e^5 times
-    as far; none where the stored depth does not vary.
+    """Inverse depths whose near end lies between the same, in steps of 15 %, and whose far end is
+    e^0.4 to e^5 times as far; none where the stored depth does not vary.
     """
     near, far = np.quantile(evidence.stored, (0.95, 0.05))
     if near == far:
@@ -237,7 +268,9 @@ def inverses(evidence: Evidence) -> list[Unit]:
 
 
 def refined(evidence: Evidence, unit: Unit) -> Unit:
-    """The unit near a given one of the least mean miss, cut off at SAME and then at a third of it."""
+    """The unit near a given one of the least mean miss, cut off at SAME and then at a third of
+    it.
+    """
     near, far = np.quantile(evidence.stored, (0.95, 0.05))
 
     def changed(x: np.ndarray) -> Unit:

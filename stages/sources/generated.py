@@ -1,4 +1,6 @@
-"""The generated source: a procedural room, ray-cast. Exact depth and labels; the same bytes for a seed."""
+"""The generated source: a procedural room, ray-cast. Exact depth and labels; the same bytes for a
+seed.
+"""
 
 from __future__ import annotations
 
@@ -44,14 +46,18 @@ def photograph(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Image u8 [H, W, 3], z-depth f32 [H, W] and labels i16 [H, W] of one camera.
 
-    Choices: one ray through each pixel's centre gives depth and label; pixels on an edge of part or crease take
-      their colour from EDGE_SAMPLES² rays. Textures are smooth at this resolution, so the others need one.
+    Choices: one ray through each pixel's centre gives depth and label; pixels on an edge of part or
+      crease take their colour from EDGE_SAMPLES² rays. Textures are smooth at this resolution, so
+      the others need one.
     """
     y, x = np.mgrid[:height, :width] + 0.5
     centres = np.stack([x.ravel(), y.ravel()], 1)
     hits, rays = trace(caster, K, pose, centres)
     light = shaded(room, caster, pose, rays, hits)
-    image, part = light.reshape(height, width, 3), np.where(hits.triangle >= 0, room.soup.parts[hits.triangle], -1)
+    image, part = (
+        light.reshape(height, width, 3),
+        np.where(hits.triangle >= 0, room.soup.parts[hits.triangle], -1),
+    )
     edge = is_edge(part.reshape(height, width), hits.normals.reshape(height, width, 3))
     rows, columns = np.nonzero(edge)
     steps = (np.arange(EDGE_SAMPLES) + 0.5) / EDGE_SAMPLES
@@ -67,15 +73,23 @@ def photograph(
     return tone_map(image), depth.reshape(height, width), labels.reshape(height, width)
 
 
-def trace(caster: RayCaster, K: np.ndarray, pose: np.ndarray, pixels: np.ndarray) -> tuple[Hits, np.ndarray]:
-    """Hits of rays through pixels [N, 2]; directions have z = 1 in the camera, so distance is z-depth."""
-    camera = np.concatenate([(pixels - K[:2, 2]) / (K[0, 0], K[1, 1]), np.ones((len(pixels), 1))], 1)
+def trace(
+    caster: RayCaster, K: np.ndarray, pose: np.ndarray, pixels: np.ndarray
+) -> tuple[Hits, np.ndarray]:
+    """Hits of rays through pixels [N, 2]; directions have z = 1 in the camera, so distance is
+    z-depth.
+    """
+    camera = np.concatenate(
+        [(pixels - K[:2, 2]) / (K[0, 0], K[1, 1]), np.ones((len(pixels), 1))], 1
+    )
     rays = (camera @ pose[:3, :3]).astype(np.float32)
     eye = -pose[:3, :3].T @ pose[:3, 3]
     return caster.cast(eye.astype(np.float32)[None], rays), rays
 
 
-def shaded(room: Room, caster: RayCaster, pose: np.ndarray, rays: np.ndarray, hits: Hits) -> np.ndarray:
+def shaded(
+    room: Room, caster: RayCaster, pose: np.ndarray, rays: np.ndarray, hits: Hits
+) -> np.ndarray:
     """Linear light [N, 3] along rays; black where nothing is hit."""
     seen = hits.triangle >= 0
     triangle, rays, distance = hits.triangle[seen], rays[seen], hits.distance[seen]
@@ -90,7 +104,9 @@ def shaded(room: Room, caster: RayCaster, pose: np.ndarray, rays: np.ndarray, hi
     gloss = np.array([m.gloss for m in room.materials], np.float32)[material]
     shininess = np.array([m.shininess for m in room.materials], np.float32)[material]
     light = np.zeros((len(seen), 3), np.float32)
-    light[seen] = shade(points, normals, to_eye, albedo, gloss, shininess, room.lights, caster.is_blocked)
+    light[seen] = shade(
+        points, normals, to_eye, albedo, gloss, shininess, room.lights, caster.is_blocked
+    )
     return light
 
 

@@ -1,7 +1,9 @@
-"""Label maps: where a source has them, what they are taken for, and which class each of their pixels is of.
+"""Label maps: where a source has them, what they are taken for, and which class each of their
+pixels is of.
 
-A view's map is a PNG of ids (grey, or a palette's), a PNG of colours, an .npy of ids [h, w] or of scores by class
-([C, h, w] or [h, w, C]), or a folder with one mask a class. All maps of a source are of one kind, which is said.
+A view's map is a PNG of ids (grey, or a palette's), a PNG of colours, an .npy of ids [h, w] or of
+scores by class ([C, h, w] or [h, w, C]), or a folder with one mask a class. All maps of a source
+are of one kind, which is said.
 """
 
 from __future__ import annotations
@@ -44,7 +46,9 @@ def place_in(folder: Path, places: Sequence[str] = LABELS) -> str | None:
 
 def files_below(folder: Path) -> list[str]:
     """Images and .npy files below a folder, as relative POSIX paths."""
-    arrays = (path.relative_to(folder).as_posix() for path in folder.rglob("*.npy") if path.name[0] != ".")
+    arrays = (
+        path.relative_to(folder).as_posix() for path in folder.rglob("*.npy") if path.name[0] != "."
+    )
     return sorted([*common.names_below(folder), *common.printable(folder, arrays)])
 
 
@@ -58,7 +62,9 @@ def of_views(place: Path, names: Sequence[str]) -> dict[str, LabelFile]:
     files = files_below(place)
     common.distinct(sorted((os.path.splitext(name)[0], place / name) for name in files))
     found = common.matched(names, files)
-    maps: dict[str, LabelFile] = {name: place / file for name, file in found.items() if _in_folders_of(name, file)}
+    maps: dict[str, LabelFile] = {
+        name: place / file for name, file in found.items() if _in_folders_of(name, file)
+    }
     if maps:
         return maps
     held: dict[str, dict[str, Path]] = {}
@@ -73,7 +79,8 @@ def of_views(place: Path, names: Sequence[str]) -> dict[str, LabelFile]:
             masks.setdefault(name, {})[label] = place / label / file
     if not masks:
         raise InputError(
-            f"{place}/ holds {few(files)}, of which none is called like a photo ({few(names)}); rename the label maps"
+            f"{place}/ holds {few(files)}, of which none is called like a photo ({few(names)}); "
+            "rename the label maps"
         )
     return dict(masks)
 
@@ -120,7 +127,9 @@ def bits_of_ids(path: Path) -> int | None:
 
 
 def names_in(folder: Path) -> dict[int, str] | None:
-    """Class names by id, of scene.json's "labels" or of labels.json: {"id": name}, or {"#rrggbb": name} of colours."""
+    """Class names by id, of scene.json's "labels" or of labels.json: {"id": name}, or {"#rrggbb":
+    name} of colours.
+    """
     scene, plain = DOCUMENTS
     path = folder / scene
     table = texts.read_json(path).get("labels") if common.present(path) else None
@@ -134,7 +143,9 @@ def names_in(folder: Path) -> dict[int, str] | None:
 
 
 def names_by_id(path: Path, entries: Iterable[tuple[Any, Any]]) -> dict[int, str]:
-    """Class names by id, from pairs in a document; ids may be written as text, colours as #rrggbb. InputError."""
+    """Class names by id, from pairs in a document; ids may be written as text, colours as #rrggbb.
+    InputError.
+    """
     names: dict[int, str] = {}
     for key, name in entries:
         try:
@@ -143,16 +154,21 @@ def names_by_id(path: Path, entries: Iterable[tuple[Any, Any]]) -> dict[int, str
             else:
                 which = whole(int(key) if isinstance(key, str) else key, 0, MAX_ID)
         except ValueError as error:
-            raise InputError(f"{path}: a label's id is not usable ({str(error)[:LONGEST]}); correct it") from None
+            raise InputError(
+                f"{path}: a label's id is not usable ({str(error)[:LONGEST]}); correct it"
+            ) from None
         if not isinstance(name, str) or not name.strip():
-            raise InputError(f"{path}: label {which} has {shortened(name)} for a name; give a text that is not empty")
+            raise InputError(
+                f"{path}: label {which} has {shortened(name)} for a name; give a "
+                "text that is not empty"
+            )
         names[which] = name.strip()
     return names
 
 
 def read(frame: Frame, listing: Listing, size: tuple[int, int], at: np.ndarray) -> np.ndarray:
-    """Raw ids i32 [H, W], -1 none, at positions `at` [2, H, W] of a frame's map, its corrected objects replaced; what
-    kind the map is of is written down in the listing.
+    """Raw ids i32 [H, W], -1 none, at positions `at` [2, H, W] of a frame's map, its corrected
+    objects replaced; what kind the map is of is written down in the listing.
     """
     assert frame.labels is not None
     if isinstance(frame.labels, dict):
@@ -176,11 +192,14 @@ def _of_image(path: Path, size: tuple[int, int], at: np.ndarray) -> tuple[str, n
     def check(image: Any) -> None:
         if image.format != "PNG":
             raise InputError(
-                f"{path} is a {image.format} picture, in which ids and colours are no longer exact; write label maps "
+                f"{path} is a {image.format} picture, in which ids and colours are no longer "
+                "exact; write label maps "
                 "as PNG or .npy"
             )
         if image.mode not in (*GREY, "1", "LA", "RGB", "RGBA"):
-            raise InputError(f"{path} has mode {image.mode}, which is neither ids nor colours; convert it")
+            raise InputError(
+                f"{path} has mode {image.mode}, which is neither ids nor colours; convert it"
+            )
         same_shape(path, image.size, size)
 
     with opened(path, REMEDY, check) as image:
@@ -205,36 +224,52 @@ def packed(colors: np.ndarray) -> np.ndarray:
 def _of_array(path: Path, size: tuple[int, int]) -> tuple[str, np.ndarray]:
     """Kind and raw ids i32 [h, w] of an .npy, in its own resolution.
 
-    Choices: the axis of classes is the one without which the array has the photo's shape; the highest score wins, and
-      where all are equal there is no label. Negative ids are none.
+    Choices: the axis of classes is the one without which the array has the photo's shape; the
+      highest score wins, and where all are equal there is no label. Negative ids are none.
     """
     values = read_npy(path, REMEDY)
     if values.ndim == 3:
-        values = values[..., 0] if values.shape[2] == 1 else values[0] if values.shape[0] == 1 else values
+        values = (
+            values[..., 0]
+            if values.shape[2] == 1
+            else values[0]
+            if values.shape[0] == 1
+            else values
+        )
     if values.dtype.kind not in "biuf" or values.ndim not in (2, 3) or not values.size:
-        raise InputError(f"{path} is {values.dtype} {values.shape}, neither ids nor scores; write it again")
+        raise InputError(
+            f"{path} is {values.dtype} {values.shape}, neither ids nor scores; write it again"
+        )
     if values.dtype.kind == "f" and not np.isfinite(values).all():
         raise InputError(f"{path} holds values that are not finite; write it again")
     if values.ndim == 2:
         same_shape(path, values.shape[::-1], size)
         if (values != np.floor(values)).any() or values.max() > MAX_ID:
-            raise InputError(f"{path} holds numbers that are no ids of 0...{MAX_ID}; write ids, or scores by class")
+            raise InputError(
+                f"{path} holds numbers that are no ids of 0...{MAX_ID}; write ids, "
+                "or scores by class"
+            )
         return IDS, np.maximum(values.astype(np.int64), -1).astype(np.int32)
     sides = {0: values.shape[1:], 2: values.shape[:2]}  # by the axis that is of classes
     axis = next((k for k, (height, width) in sides.items() if fits((width, height), size)), None)
     if axis is None:
-        raise InputError(f"{path} is {values.shape}, which has not the shape of its photo {size[::-1]}; write it again")
+        raise InputError(
+            f"{path} is {values.shape}, which has not the shape of its photo "
+            f"{size[::-1]}; write it again"
+        )
     if axis == 2 and values.shape[2] == 3 and values.dtype == np.uint8 and values.max() > 1:
         return COLORS, packed(values)
     best: np.ndarray = values.argmax(axis)
     return SCORES, np.where(values.max(axis) > values.min(axis), best, -1).astype(np.int32)
 
 
-def _of_masks(masks: dict[str, Path], names: dict[int, str], size: tuple[int, int], at: np.ndarray) -> np.ndarray:
+def _of_masks(
+    masks: dict[str, Path], names: dict[int, str], size: tuple[int, int], at: np.ndarray
+) -> np.ndarray:
     """Raw ids of masks by class, -1 in none of them.
 
-    Choices: a mask is where its picture is brighter than half of its brightest; of two that overlap the smaller lies on
-      top.
+    Choices: a mask is where its picture is brighter than half of its brightest; of two that overlap
+      the smaller lies on top.
     """
     number = {name: which for which, name in names.items()}
     seen = {name: companion(path, size, at) for name, path in masks.items()}
@@ -246,29 +281,49 @@ def _of_masks(masks: dict[str, Path], names: dict[int, str], size: tuple[int, in
 
 
 def resolved(listing: Listing, raw: np.ndarray) -> tuple[str, np.ndarray]:
-    """What all maps of a listing are taken for, and their raw ids [V, H, W]; colours that are all grey are ids.
+    """What all maps of a listing are taken for, and their raw ids [V, H, W]; colours that are all
+    grey are ids.
 
     Raises: InputError where they are of two kinds, or of more colours than labels have.
     """
     kinds = set(listing.label_kinds.values())
     if len(kinds) > 1:
-        views = {kind: [view for view, of in listing.label_kinds.items() if of == kind] for kind in sorted(kinds)}
+        views = {
+            kind: [view for view, of in listing.label_kinds.items() if of == kind]
+            for kind in sorted(kinds)
+        }
         told = ", ".join(f"{kind} ({few(some)})" for kind, some in views.items())
-        raise InputError(f"{listing.label_place}/ holds label maps of several kinds: {told}; write them alike")
+        raise InputError(
+            f"{listing.label_place}/ holds label maps of several kinds: {told}; write them alike"
+        )
     (kind,) = kinds
-    if kind == COLORS and all((view[view >= 0] % packed(np.ones(3, int)) == 0).all() for view in raw):
+    if kind == COLORS and all(
+        (view[view >= 0] % packed(np.ones(3, int)) == 0).all() for view in raw
+    ):
         return IDS, np.where(raw < 0, -1, raw & 255)
     if kind == COLORS and (n := len(_shares(raw))) > MAX_COLORS:
-        raise InputError(f"{listing.label_place}/ holds {n} colours, more than labels have; write ids, unsmoothed")
+        raise InputError(
+            f"{listing.label_place}/ holds {n} colours, more than labels have; write "
+            "ids, unsmoothed"
+        )
     return kind, raw
 
 
 def line(listing: Listing, kind: str, labels: np.ndarray) -> str:
-    """What the maps were taken for, in one sentence. labels: i16 [V, H, W], class indices, -1 none."""
-    named = "" if kind == MASKS else " with names" if listing.label_names is not None else " without names"
+    """What the maps were taken for, in one sentence. labels: i16 [V, H, W], class indices, -1
+    none.
+    """
+    named = (
+        ""
+        if kind == MASKS
+        else " with names"
+        if listing.label_names is not None
+        else (" without names")
+    )
     known = labels >= 0
     return (
-        f"Labels of {listing.label_place}/ are taken for {kind}{named}: {len(np.unique(labels[known]))} classes, "
+        f"Labels of {listing.label_place}/ are taken for {kind}{named}: "
+        f"{len(np.unique(labels[known]))} classes, "
         f"{known.mean():.1%} of the pixels, in {known.any((1, 2)).sum()} of {len(labels)} views."
     )
 
@@ -280,11 +335,12 @@ def indexed(
     kind: str = IDS,
     what: str = "Label",
 ) -> tuple[np.ndarray, list[str], list[str]]:
-    """Raw ids [V, H, W] (-1: none) as indices i16 into class names; the names, and notes on what became -1.
+    """Raw ids [V, H, W] (-1: none) as indices i16 into class names; the names, and notes on what
+    became -1.
 
-    Choices: the classes are those that occur, in the order of their ids, or `class_names` where given; names that are
-      spelt differently are one. Ids are named by `names`, else by their place in `class_names`, else as `unnamed` does.
-      Names that say void (`is_void`) are ignored.
+    Choices: the classes are those that occur, in the order of their ids, or `class_names` where
+      given; names that are spelt differently are one. Ids are named by `names`, else by their place
+      in `class_names`, else as `unnamed` does. Names that say void (`is_void`) are ignored.
     Raises:  DataFailure if nothing is left.
     """
     shares = _shares(raw)
@@ -304,10 +360,15 @@ def indexed(
     result = list(class_names or {joined(name): name for name in named.values()}.values())
     rows = dict(zip(named, rows_of(named.values(), result), strict=True))
     if foreign := sorted({named[v] for v, row in rows.items() if row < 0}):
-        notes.append(f"{what}s that are not among the class names are ignored: {', '.join(foreign)}.")
+        notes.append(
+            f"{what}s that are not among the class names are ignored: {', '.join(foreign)}."
+        )
     if max(rows.values(), default=-1) < 0:
         shown = ", ".join(_shown(v, kind) for v in present[:8])
-        raise DataFailure(f"no label has a name ({kind} [{shown}]); give names (labels.json), or take the labels away")
+        raise DataFailure(
+            f"no label has a name ({kind} [{shown}]); give names (labels.json), or "
+            "take the labels away"
+        )
     every = np.array(sorted(shares))
     table = np.array([rows.get(value, -1) for value in every.tolist()], np.int16)
     labels = np.empty(raw.shape, np.int16)
@@ -316,25 +377,36 @@ def indexed(
     return labels, result, notes
 
 
-def unnamed(present: Sequence[int], shares: Counter[int], kind: str, what: str) -> tuple[dict[int, str], list[str]]:
+def unnamed(
+    present: Sequence[int], shares: Counter[int], kind: str, what: str
+) -> tuple[dict[int, str], list[str]]:
     """Names of ids that a source does not name, and a note on the one that stands for void.
 
-    Choices: ids are class_<id> without 0, or without what `void_code` tells, 0 being a class then; colours are
-      themselves, without black; of scores each is a class.
+    Choices: ids are class_<id> without 0, or without what `void_code` tells, 0 being a class then;
+      colours are themselves, without black; of scores each is a class.
     """
     code = void_code(present) if kind == IDS else None
     void = [v for v in present if v == (0 if code is None else code)] if kind != SCORES else []
-    known = {v: _shown(v, kind) if kind == COLORS else f"class_{v}" for v in present if v not in void}
-    told = "is taken for none of the classes" if code is None else "is taken for void, and 0 for a class"
+    known = {
+        v: _shown(v, kind) if kind == COLORS else f"class_{v}" for v in present if v not in void
+    }
+    told = (
+        "is taken for none of the classes"
+        if code is None
+        else ("is taken for void, and 0 for a class")
+    )
     lost = f"; {_told(void, shares, kind)} {told}" if void else ""
     return known, [f"{what}s have no names (labels.json){lost}."]
 
 
 def void_code(present: Sequence[int]) -> int | None:
-    """Which of CODES stands for void among ids without names, 0 being a class then; None where none does.
+    """Which of CODES stands for void among ids without names, 0 being a class then; None where none
+    does.
 
-    Choices: the highest id is one of them, far above the others, which are two at least and fill half of the numbers up
-      to the highest of them: a data set's ids, of which some do not occur here. 0 and 255 alone are a mask.
+    Choices: the highest id is one of them, far above the others, which are two at least and fill
+      half of the numbers up
+      to the highest of them: a data set's ids, of which some do not occur here. 0 and 255 alone are
+        a mask.
     """
     *others, code = present or [0]
     dense = len(others) > 1 and 2 * len(others) > max(others)

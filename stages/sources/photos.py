@@ -1,4 +1,6 @@
-"""The photos source: a folder of images and nothing else. Cameras and poses come from the stage `pose`."""
+"""The photos source: a folder of images and nothing else. Cameras and poses come from the stage
+`pose`.
+"""
 
 from __future__ import annotations
 
@@ -26,18 +28,26 @@ SEAM = 3.0  # times what neighbouring columns differ by: a panorama's first and 
 
 
 def read(folder: Path, settings: IngestSection, model: PhotoModel) -> dict[str, Any]:
-    """The fields of a capture: the photos of a model, without what their lenses bend, and its points."""
+    """The fields of a capture: the photos of a model, without what their lenses bend, and its
+    points.
+    """
     shots = {shot.name: shot for shot in _listed(folder)[0]}
     if absent := [name for name in model.names if name not in shots]:
-        raise InputError(f"{folder} has no photo {absent[0]}, which the model has; restore it, or run pose again")
+        raise InputError(
+            f"{folder} has no photo {absent[0]}, which the model has; restore it, or run pose again"
+        )
     frames = []
     for view, name in enumerate(model.names):
         camera = cameras.camera_of(shots[name].path, *model.cameras[model.camera[view]])
-        frames.append(Frame(name, shots[name].path, camera, model.cam_from_world[view], mask=shots[name].mask))
+        frames.append(
+            Frame(name, shots[name].path, camera, model.cam_from_world[view], mask=shots[name].mask)
+        )
     listing = Listing("photos", frames, notes=list(model.notes), upright=True)
     fields = assembly.assemble(listing, settings)
     lost = assembly.in_empty_space(model.points, fields, listing)
-    return fields | points_of(Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields, lost)
+    return fields | points_of(
+        Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields, lost
+    )
 
 
 def probe(folder: Path) -> dict[str, bool]:
@@ -53,8 +63,9 @@ def files(folder: Path) -> list[Path]:
 
 
 def _photos(folder: Path) -> tuple[Path, list[str]]:
-    """The folder of the photos, and their paths below it: those that lie in it; otherwise in images/ or the like;
-    otherwise in its subfolders, one for each camera. Raises InputError if there are none.
+    """The folder of the photos, and their paths below it: those that lie in it; otherwise in
+    images/ or the like; otherwise in its subfolders, one for each camera. Raises InputError if
+    there are none.
     """
     try:
         names = [name for name in os.listdir(folder) if is_image(name)]
@@ -65,33 +76,44 @@ def _photos(folder: Path) -> tuple[Path, list[str]]:
         place = common.photo_folder(folder)
         names = list(common.names_below(place))
     if not names:
-        place, inner = folder, [name for name in common.with_photos(folder) if name not in common.BESIDE]
+        place, inner = (
+            folder,
+            [name for name in common.with_photos(folder) if name not in common.BESIDE],
+        )
         names = [f"{name}/{file}" for name in inner for file in common.names_below(folder / name)]
     if not names:
         raise InputError(f"{folder} holds no .jpg, .png or .heic image; correct source.path")
     return place, sorted(common.printable(place, names))
 
 
-def shots(folder: Path, settings: PoseSection, shown: Progress | None, finer: int) -> tuple[list[Shot], list[str]]:
+def shots(
+    folder: Path, settings: PoseSection, shown: Progress | None, finer: int
+) -> tuple[list[Shot], list[str]]:
     """The photos of a folder, at most `max_views` of them, evenly chosen, and notes about them."""
     found, notes = _listed(folder)
     first: dict[str, Shot] = {}
     for shot in found:
         first.setdefault(sha256_file(shot.path), shot)
     if len(first) < len(found):
-        notes.append(f"{len(found) - len(first)} of {len(found)} photos are copies of others, and left out.")
+        notes.append(
+            f"{len(found) - len(first)} of {len(found)} photos are copies of others, and left out."
+        )
         found = list(first.values())
     if settings.max_views is not None and len(found) > settings.max_views:
         rows = np.linspace(0, len(found) - 1, settings.max_views).round().astype(int)
         notes.append(f"{len(rows)} of {len(found)} photos are used (pose.max_views).")
         found = [found[row] for row in rows]
     if n := sum(shot.focal is None and not shot.panorama for shot in found):
-        notes.append(f"{n} of {len(found)} photos have no focal length; it is found with the poses.")
+        notes.append(
+            f"{n} of {len(found)} photos have no focal length; it is found with the poses."
+        )
     return found, notes
 
 
 def save(found: Sequence[Shot], _: Path, pictures: Path, max_side: int) -> None:
-    """Write photos, reduced until no side exceeds `max_side`, and their masks, where pycolmap looks for them."""
+    """Write photos, reduced until no side exceeds `max_side`, and their masks, where pycolmap looks
+    for them.
+    """
     for row, shot in enumerate(found):
         size = shot.reduced(max_side)
         with open_photo(shot.path, shot.size, upright=True) as (image, _opaque):
@@ -102,7 +124,9 @@ def save(found: Sequence[Shot], _: Path, pictures: Path, max_side: int) -> None:
             seen = np.full(shot.size[::-1], 255, np.uint8)
             if shot.mask is not None:
                 with opened(shot.mask) as mask:
-                    seen = np.where(np.asarray(mask.convert("L") if mask.mode not in DEEP else mask) > 0, 255, 0)
+                    seen = np.where(
+                        np.asarray(mask.convert("L") if mask.mode not in DEEP else mask) > 0, 255, 0
+                    )
             mask = Image.fromarray(seen.astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
             mask.save(pictures / "masks" / f"{file_of(row)}.png")
 
@@ -117,14 +141,19 @@ def _listed(folder: Path) -> tuple[list[Shot], list[str]]:
         found.append(Shot(common.stem(name), place / name, size, focal, masks.get(name), panorama))
     used = {place.name, *(name.partition("/")[0] for name in names)}
     if beside := set(common.with_photos(folder)) - used:
-        notes.append(f"Photos in these folders are not read: {', '.join(sorted(beside, key=common.natural))}.")
+        notes.append(
+            "Photos in these folders are not read: "
+            f"{', '.join(sorted(beside, key=common.natural))}."
+        )
     found.sort(key=lambda shot: common.natural(shot.name))
     common.distinct((shot.name, shot.path) for shot in found)
     return found, notes
 
 
 def wraps(path: Path, size: tuple[int, int]) -> bool:
-    """Whether a photo ends at the right where it begins at the left, as one of all directions does."""
+    """Whether a photo ends at the right where it begins at the left, as one of all directions
+    does.
+    """
     with open_photo(path, size, upright=True) as (image, _):
         pixels = np.asarray(image.resize((256, 128), Image.Resampling.BOX), np.float32)
     between = np.abs(np.diff(pixels, axis=1)).mean()

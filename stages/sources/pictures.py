@@ -22,11 +22,16 @@ LARGEST = 16 << 20  # bytes of a view's confidences: 4 million in single precisi
 
 
 @contextmanager
-def open_photo(path: Path, size: tuple[int, int], upright: bool) -> Iterator[tuple[Any, np.ndarray | None]]:
-    """An RGB image of (width, height) `size`, and where it is opaque (None: everywhere), as `opened` gives one.
+def open_photo(
+    path: Path, size: tuple[int, int], upright: bool
+) -> Iterator[tuple[Any, np.ndarray | None]]:
+    """An RGB image of (width, height) `size`, and where it is opaque (None: everywhere), as
+    `opened` gives one.
 
-    Choices: a model's own photos are turned by EXIF only if they fit its camera no other way, since COLMAP counts
-      pixels as they are stored. What is transparent is empty: it lies before black, as what is rendered does; alpha
+    Choices: a model's own photos are turned by EXIF only if they fit its camera no other way, since
+      COLMAP counts
+      pixels as they are stored. What is transparent is empty: it lies before black, as what is
+        rendered does; alpha
       under one half is transparent.
     """
 
@@ -35,7 +40,9 @@ def open_photo(path: Path, size: tuple[int, int], upright: bool) -> Iterator[tup
             raise InputError(f"{path} is no 8-bit photo (mode {image.mode}); convert it to 8 bits")
         found = seen_size(image) if upright or image.size != size else image.size
         if found != size:
-            raise InputError(f"{path} is {_by(found)}, its camera {_by(size)}; restore the image or its camera")
+            raise InputError(
+                f"{path} is {_by(found)}, its camera {_by(size)}; restore the image or its camera"
+            )
 
     with opened(path, check=check) as image:
         if upright or image.size != size:
@@ -58,8 +65,8 @@ def companion(
     modes: set[str] | None = None,
     wanted: str = "",
 ) -> np.ndarray:
-    """The pixels at `at` [2, H, W] of a one-channel image that belongs to a photo of (width, height) `size`, in any
-    resolution of that photo's shape.
+    """The pixels at `at` [2, H, W] of a one-channel image that belongs to a photo of (width,
+    height) `size`, in any resolution of that photo's shape.
 
     Args: modes: PIL's, that are taken as they are; None: all, as grey values.
     Raises: InputError naming the file.
@@ -67,7 +74,9 @@ def companion(
 
     def check(image: Any) -> None:
         if modes is not None and image.mode not in modes:
-            raise InputError(f"{path} has mode {image.mode}, not {wanted} in one channel; convert it")
+            raise InputError(
+                f"{path} has mode {image.mode}, not {wanted} in one channel; convert it"
+            )
         same_shape(path, image.size, size)
 
     with opened(path, "add it, or take its folder away to do without", check) as image:
@@ -87,17 +96,24 @@ def same_shape(path: Path, found: tuple[int, int], size: tuple[int, int]) -> Non
 
 
 def confidences(path: Path) -> np.ndarray:
-    """The array `confidence` [h, w] of an .npz file, f32 in [0, 1]; nothing in it is unpickled. Raises InputError."""
+    """The array `confidence` [h, w] of an .npz file, f32 in [0, 1]; nothing in it is unpickled.
+    Raises InputError.
+    """
     held = read_npz(path, ["confidence"], "copy it again", LARGEST).get("confidence")
     found = None if held is None else finite32(held)
-    if found is None or found.ndim != 2 or not found.size or not ((found >= 0) & (found <= 1 + 1e-4)).all():
+    if (
+        found is None
+        or found.ndim != 2
+        or not found.size
+        or not ((found >= 0) & (found <= 1 + 1e-4)).all()
+    ):
         raise InputError(f"{path}: `confidence` must be an image of values in 0...1; copy it again")
     return found.clip(0, 1)
 
 
 def nearest(values: np.ndarray, at: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Those stored pixels [H, W] of `values` [h, w], or [h, w, C], that hold positions `at` [2, H, W] in a photo of
-    (width, height).
+    """Those stored pixels [H, W] of `values` [h, w], or [h, w, C], that hold positions `at` [2, H,
+    W] in a photo of (width, height).
     """
     height, width = values.shape[:2]
     column = np.clip(np.floor(at[0] * (width / size[0])).astype(int), 0, width - 1)

@@ -1,4 +1,5 @@
-"""ScanNet as its own tools export it, and as two groups lay it out: Semantic Gaussians (SG: points3d.ply and a table of
+"""ScanNet as its own tools export it, and as two groups lay it out: Semantic Gaussians (SG:
+points3d.ply and a table of
 20 classes) and Panoptic Lifting (PL: splits.json).
 """
 
@@ -21,9 +22,11 @@ from chebsplat.stages.sources.texts import LONGEST, read_table
 SENSOR = 1296  # width of the colour sensor, which intrinsics refer to even where images are reduced
 OFF_CENTRE = 0.1  # of the width, by which a principal point may lie off the middle
 POINTS = "points3d.ply"
-PSEUDO, CONFIDENCE = "m2f_semantics", "m2f_probabilities"  # of Mask2Former with test-time augmentation
+# of Mask2Former with test-time augmentation
+PSEUDO, CONFIDENCE = "m2f_semantics", "m2f_probabilities"
 PL_IDS = "semantics"  # where PL has ScanNet's own ids
-OF_PL = ("splits.json", "segmentation_data.pkl", "rs_semantics", "m2f_semantics")  # never in an SG folder
+# never in an SG folder
+OF_PL = ("splits.json", "segmentation_data.pkl", "rs_semantics", "m2f_semantics")
 MODIFIED, COMBINED = "scannetv2-labels.modified.tsv", "scannet-labels.combined.tsv"
 OWN = "scannetv2-labels.combined.tsv"  # ScanNet's, of which COMBINED is PL's copy
 NYU = ("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf", "picture", "counter",
@@ -33,7 +36,8 @@ NYU = ("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "win
        "otherprop")  # fmt: skip
 OTHER = "otherprop"  # SG's id 0: known and ignored
 CORRECTED = 60_000  # plus an NYU class: raw ids of hand-corrected objects, above all of ScanNet's
-# Objects that the authors of Panoptic Lifting relabel by hand, as ScanNet has them wrong: object id -> NYU class.
+# Objects that the authors of Panoptic Lifting relabel by hand, as ScanNet has them wrong: object id
+# -> NYU class.
 CORRECTIONS: dict[str, dict[int, int]] = {
     "scene0050_02": {24: 37, 26: 37, 12: 6, 1: 6, 16: 9},
     "scene0144_01": {4: 3, 13: 3, 5: 3},
@@ -57,7 +61,9 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
         outside = [frame for frame in listing.frames if frame.name not in known]
         listing.frames = [frame for frame in listing.frames if frame.name in known]
         if outside:
-            listing.notes.append(f"{len(outside)} frames are in neither list of splits.json and are left out.")
+            listing.notes.append(
+                f"{len(outside)} frames are in neither list of splits.json and are left out."
+            )
     fields = assembly.assemble(listing, settings, class_names)
     if split is not None:
         assembly.give_split(fields, split[1], "splits.json")
@@ -67,13 +73,17 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """Light: reads names only. Depth that some frame has, every frame must have: `read` fails otherwise."""
+    """Light: reads names only. Depth that some frame has, every frame must have: `read` fails
+    otherwise.
+    """
     return {"poses": True, "depth": any(common.names_below(folder / "depth")),
             "labels": _labels_folder(folder) is not None, "pseudo_labels": _has_pseudo_labels(folder)}  # fmt: skip
 
 
 def files(folder: Path) -> list[Path]:
-    """Poses, intrinsics, points, split, label table, and every image, depth, label and object image."""
+    """Poses, intrinsics, points, split, label table, and every image, depth, label and object
+    image.
+    """
     table = _table(folder)
     with_objects = _is_reduced(folder) and _labels_folder(folder) == PL_IDS
     places = ["color", "depth", *(["instance"] if with_objects else [])]
@@ -83,8 +93,14 @@ def files(folder: Path) -> list[Path]:
     if _has_pseudo_labels(folder):
         data += [folder / PSEUDO / name for name in common.names_below(folder / PSEUDO)]
         texts += list((folder / CONFIDENCE).glob("*.npz"))
-    single = [folder / name for name in (POINTS, "splits.json", *labels.DOCUMENTS) if common.present(folder / name)]
-    return sorted([*data, *texts, *single, *([table] if table is not None and common.present(table) else [])])
+    single = [
+        folder / name
+        for name in (POINTS, "splits.json", *labels.DOCUMENTS)
+        if common.present(folder / name)
+    ]
+    return sorted(
+        [*data, *texts, *single, *([table] if table is not None and common.present(table) else [])]
+    )
 
 
 def _has_pseudo_labels(folder: Path) -> bool:
@@ -106,20 +122,24 @@ def _labels_folder(folder: Path) -> str | None:
 
 
 def _table(folder: Path) -> Path | None:
-    """The nearest table that ScanNet's ids may be looked up in; where there is none, the place where it should be."""
+    """The nearest table that ScanNet's ids may be looked up in; where there is none, the place
+    where it should be.
+    """
     place, reduced = _labels_folder(folder), _is_reduced(folder)
     if place in (None, "rs_semantics"):
         return None
     wanted = (COMBINED,) if reduced else (MODIFIED, OWN, COMBINED)
-    return next(filter(None, (common.nearest_file(folder, name) for name in wanted)), folder / wanted[0])
+    return next(
+        filter(None, (common.nearest_file(folder, name) for name in wanted)), folder / wanted[0]
+    )
 
 
 def _give_labels(listing: Listing, folder: Path) -> None:
     """Give the frames their label maps, and the listing the names of their ids.
 
     Choices: PL's have its names; otherwise those of labels.json go first. In label/ and the like
-      ids of 16 bits are ScanNet's own, those of 8 bits NYU's 40, as the set of 25,000 frames has them.
-      Colours and what is in an .npy labels.json alone names.
+      ids of 16 bits are ScanNet's own, those of 8 bits NYU's 40, as the set of 25,000 frames has
+      them. Colours and what is in an .npy labels.json alone names.
     """
     labels.give(listing, folder, _label_places(folder))
     place = listing.label_place
@@ -129,11 +149,15 @@ def _give_labels(listing: Listing, folder: Path) -> None:
     if place == "rs_semantics" and maps:
         listing.label_names = dict(enumerate(("void", *scannet_closed.CLASSES)))
     elif place == PL_IDS and maps and _is_reduced(folder):
-        listing.label_names, listing.corrections = reduced_names(_table(folder), folder.resolve().name)
+        listing.label_names, listing.corrections = reduced_names(
+            _table(folder), folder.resolve().name
+        )
         for frame in listing.frames:
             frame.objects = folder / f"instance/{frame.name}.png" if frame.labels else None
         if listing.corrections:
-            listing.notes.append(f"{len(listing.corrections)} objects take the hand-corrected labels of this scene.")
+            listing.notes.append(
+                f"{len(listing.corrections)} objects take the hand-corrected labels of this scene."
+            )
     elif listing.label_names is not None or (bits := labels.bits_of_ids(maps[0])) is None:
         listing.class_names = None
     elif place != "label-filt" and bits == 8:
@@ -144,7 +168,9 @@ def _give_labels(listing: Listing, folder: Path) -> None:
         nyu = _column(table, OWN, "nyu40id", 41, empty=40)
         listing.label_names = {raw: ("void", *NYU)[k] for raw, k in nyu.items()} | {0: "void"}
         listing.class_names = None
-        listing.notes.append(f"Classes are NYU's 40, of {table.name}; scannet-open has 20, of {MODIFIED}.")
+        listing.notes.append(
+            f"Classes are NYU's 40, of {table.name}; scannet-open has 20, of {MODIFIED}."
+        )
     else:
         listing.label_names = mapped(table)
 
@@ -152,16 +178,24 @@ def _give_labels(listing: Listing, folder: Path) -> None:
 def _camera(folder: Path, kind: str, size: tuple[int, int], sensor: int) -> Camera:
     """The camera of the colour or depth images.
 
-    Choices: intrinsics are those of the images as they are or of the whole sensor, whichever has its principal point
-      nearer to the middle; they count from the centre of the first pixel, as depth's 319.5 of 640 shows.
+    Choices: intrinsics are those of the images as they are or of the whole sensor, whichever has
+      its principal point nearer to the middle; they count from the centre of the first pixel, as
+      depth's 319.5 of 640 shows.
     """
     path = folder / f"intrinsic/intrinsic_{kind}.txt"
     K = texts.read_matrix(path)
     whole = min((size[0], sensor), key=lambda width: abs(2 * K[0, 2] - width))
     if abs(2 * K[0, 2] - whole) > OFF_CENTRE * whole:
-        raise InputError(f"{path}: a principal point at {K[0, 2]:g} fits no width of {size[0]}; restore the file")
+        raise InputError(
+            f"{path}: a principal point at {K[0, 2]:g} fits no width of {size[0]}; restore the file"
+        )
     factor = size[0] / whole
-    params = (K[0, 0] * factor, K[1, 1] * factor, (K[0, 2] + 0.5) * factor, (K[1, 2] + 0.5) * factor)
+    params = (
+        K[0, 0] * factor,
+        K[1, 1] * factor,
+        (K[0, 2] + 0.5) * factor,
+        (K[1, 2] + 0.5) * factor,
+    )
     return cameras.camera_of(path, "PINHOLE", params, *size)
 
 
@@ -171,11 +205,15 @@ def _split(path: Path) -> tuple[set[str], set[str]] | None:
         return None
     document = texts.read_json(path)
     lists: list[Any] = [document.get(side) for side in ("train", "test")]
-    if not all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists):
+    if not all(
+        isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists
+    ):
         raise InputError(f"{path} lacks lists of train and test names; restore the file")
     sides = [set(names) for names in lists]
     if both := sides[0] & sides[1]:
-        raise InputError(f"{path}: {min(both)} is both a training and a test view; restore the file")
+        raise InputError(
+            f"{path}: {min(both)} is both a training and a test view; restore the file"
+        )
     return sides[0], sides[1]
 
 
@@ -202,13 +240,20 @@ def _listing(folder: Path) -> Listing:
     ]
     reduced = _is_reduced(folder)
     protocol = scannet_closed if reduced else scannet_open
-    listing = Listing("scannet", frames, class_names=protocol.CLASSES if has["labels"] or pseudo else None)
+    listing = Listing(
+        "scannet", frames, class_names=protocol.CLASSES if has["labels"] or pseudo else None
+    )
     listing.pseudo_names = dict(enumerate(("void", *scannet_closed.CLASSES))) if pseudo else None
     intrinsics = folder / "intrinsic/intrinsic_color.txt"
     listing.notes += texts.skew_note(intrinsics, texts.read_matrix(intrinsics))
-    listing.notes.append(f"ScanNet as {'Panoptic Lifting' if reduced else 'Semantic Gaussians'} lays it out.")
+    listing.notes.append(
+        f"ScanNet as {'Panoptic Lifting' if reduced else 'Semantic Gaussians'} lays it out."
+    )
     if not reduced and not common.present(folder / POINTS):
-        listing.notes[-1] = f"ScanNet as its own tools export it, without {POINTS}: points are of depth, or matched."
+        listing.notes[-1] = (
+            f"ScanNet as its own tools export it, without {POINTS}: points are of "
+            "depth, or matched."
+        )
     if extra := sum(path.stem not in set(names) for path in (folder / "pose").glob("*.txt")):
         listing.notes.append(f"{extra} poses have no image in color/ and are left out.")
     if has["depth"] and common.present(folder / "intrinsic/intrinsic_depth.txt"):
@@ -222,13 +267,18 @@ def _listing(folder: Path) -> Listing:
 
 
 def mapped(path: Path | None) -> dict[int, str]:
-    """Class names by raw id through the table's column `cocomapid`; 0 is `otherprop`, which is no class."""
+    """Class names by raw id through the table's column `cocomapid`; 0 is `otherprop`, which is no
+    class.
+    """
     names = (OTHER, *scannet_open.CLASSES)
-    return {raw: names[value] for raw, value in _column(path, MODIFIED, "cocomapid", len(names)).items()}
+    return {
+        raw: names[value] for raw, value in _column(path, MODIFIED, "cocomapid", len(names)).items()
+    }
 
 
 def reduced_names(path: Path | None, scene: str) -> tuple[dict[int, str], dict[int, int]]:
-    """Class names by raw id through the table's column `nyu40id`, and the scene's corrections by object id.
+    """Class names by raw id through the table's column `nyu40id`, and the scene's corrections by
+    object id.
 
     Choices: an id whose `nyu40id` is empty is NYU's 40, other props; 0 is void.
     """
@@ -239,18 +289,28 @@ def reduced_names(path: Path | None, scene: str) -> tuple[dict[int, str], dict[i
     return names, {which: CORRECTED + value for which, value in fixes.items()}
 
 
-def _column(path: Path | None, name: str, column: str, n_values: int, empty: int | None = None) -> dict[int, int]:
-    """A column of whole numbers below `n_values`, by the column `id`; of an id listed twice the last row counts."""
+def _column(
+    path: Path | None, name: str, column: str, n_values: int, empty: int | None = None
+) -> dict[int, int]:
+    """A column of whole numbers below `n_values`, by the column `id`; of an id listed twice the
+    last row counts.
+    """
     if path is None or not present(path):
         raise InputError(f"{path} is missing; put {name} into the scene's folder or one above it")
     rows = read_table(path, f"take {name}")
     try:
-        found = {int(row["id"]): int(row[column]) if row[column] or empty is None else empty for row in rows}
+        found = {
+            int(row["id"]): int(row[column]) if row[column] or empty is None else empty
+            for row in rows
+        }
     except (KeyError, TypeError, ValueError) as error:
         reason = str(error)[:LONGEST]
-        raise InputError(f"{path} has no usable columns id and {column} ({reason}); take {name}") from None
+        raise InputError(
+            f"{path} has no usable columns id and {column} ({reason}); take {name}"
+        ) from None
     if not found or min(found) < 0 or not all(0 <= value < n_values for value in found.values()):
         raise InputError(
-            f"{path}: ids must not be negative, and values of {column} must lie in 0...{n_values - 1}; take {name}"
+            f"{path}: ids must not be negative, and values of {column} must lie in "
+            f"0...{n_values - 1}; take {name}"
         )
     return found

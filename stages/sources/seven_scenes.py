@@ -30,8 +30,14 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """Light: reads names only. What some frame has, every frame must have: `read` fails otherwise."""
-    depth = any(name.endswith(".depth.png") for place in _places(folder) for name in os.listdir(folder / place))
+    """Light: reads names only. What some frame has, every frame must have: `read` fails
+    otherwise.
+    """
+    depth = any(
+        name.endswith(".depth.png")
+        for place in _places(folder)
+        for name in os.listdir(folder / place)
+    )
     return {"poses": True, "depth": depth, "labels": False}
 
 
@@ -46,17 +52,28 @@ def files(folder: Path) -> list[Path]:
 
 def _intrinsics(folder: Path) -> Path | None:
     places = (folder, folder.absolute().parent)
-    return next((p / "camera-intrinsics.txt" for p in places if common.present(p / "camera-intrinsics.txt")), None)
+    return next(
+        (
+            p / "camera-intrinsics.txt"
+            for p in places
+            if common.present(p / "camera-intrinsics.txt")
+        ),
+        None,
+    )
 
 
 def _places(folder: Path) -> list[str]:
     """The folder itself and its sequences, as they precede the names of what they hold."""
-    sequences = [name for name in os.listdir(folder) if name[:4] == "seq-" and (folder / name).is_dir()]
+    sequences = [
+        name for name in os.listdir(folder) if name[:4] == "seq-" and (folder / name).is_dir()
+    ]
     return ["", *(f"{name}/" for name in sorted(sequences))]
 
 
 def _frames(folder: Path) -> list[tuple[str, str, set[str]]]:
-    """(name, colour image, files of its folder) of each frame, as POSIX paths below the folder, in natural order."""
+    """(name, colour image, files of its folder) of each frame, as POSIX paths below the folder, in
+    natural order.
+    """
     frames = []
     for place in _places(folder):
         found = {place + name for name in os.listdir(folder / place)}
@@ -70,7 +87,10 @@ def _frames(folder: Path) -> list[tuple[str, str, set[str]]]:
 def _listing(folder: Path) -> Listing:
     frames = _frames(folder)
     if not frames:
-        raise InputError(f"{folder} holds no frame-*.color.jpg or .png, nor does a seq-*/ in it; correct source.path")
+        raise InputError(
+            f"{folder} holds no frame-*.color.jpg or .png, nor does a seq-*/ in it; "
+            "correct source.path"
+        )
     (width, height), _ = header(folder / frames[0][1])
     path, image = _intrinsics(folder), folder / frames[0][1]
     focal, centre = COLOR * width / 640, np.array([width, height]) / 2 + CENTRE * width / 640
@@ -81,7 +101,9 @@ def _listing(folder: Path) -> Listing:
     if path is not None:
         K = texts.read_matrix(path)
         notes = texts.skew_note(path, K)
-    depth_camera = cameras.camera_of(path or image, "PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
+    depth_camera = cameras.camera_of(
+        path or image, "PINHOLE", (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height
+    )
     beside = f"{1000 * np.linalg.norm(OFFSET):.0f} mm beside the depth camera"
     notes += [f"The colour camera's focal length is taken to be {focal:g} pixels, {beside}."]
     names = [name for name, _, _ in frames]
@@ -90,7 +112,11 @@ def _listing(folder: Path) -> Listing:
     poses[:, :3, 3] += OFFSET
     has_depth = probe(folder)["depth"]
     listed = [
-        Frame(name, folder / image, camera, pose, folder / f"{name}.depth.png" if has_depth else None)
+        Frame(
+            name, folder / image, camera, pose, folder / f"{name}.depth.png" if has_depth else None
+        )
         for (name, image, _), pose in zip(frames, poses, strict=True)
     ]
-    return Listing("seven_scenes", listed, depth_camera=depth_camera, depth_offset=OFFSET, notes=notes)
+    return Listing(
+        "seven_scenes", listed, depth_camera=depth_camera, depth_offset=OFFSET, notes=notes
+    )

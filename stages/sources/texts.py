@@ -1,4 +1,6 @@
-"""Texts of a source: JSON objects, tables and matrices of numbers, each complete or named in an InputError."""
+"""Texts of a source: JSON objects, tables and matrices of numbers, each complete or named in an
+InputError.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +17,24 @@ from chebsplat.formats.files import parse_json, read_text
 
 LEAST_SKEW = 0.01  # pixels
 LONGEST = 80  # characters of a value that a message repeats
-LARGEST = 8 << 20  # bytes of a table: 20,000 poses at full precision; its words take up to 60 times as much memory
+# bytes of a table: 20,000 poses at full precision; its words take up to 60 times as much memory
+LARGEST = 8 << 20
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """The object in a JSON file. Raises InputError."""
     document = parse_json(path)
     if not isinstance(document, dict):
-        raise InputError(f"{path} holds a {type(document).__name__}, not an object; restore the file")
+        raise InputError(
+            f"{path} holds a {type(document).__name__}, not an object; restore the file"
+        )
     return document
 
 
 def number(value: Any) -> float:
-    """A finite number that is written as one. Raises ValueError on text, true, null, inf, nan and beyond float64."""
+    """A finite number that is written as one. Raises ValueError on text, true, null, inf, nan and
+    beyond float64.
+    """
     if isinstance(value, (int, float, np.number)) and not isinstance(value, bool):
         try:
             if math.isfinite(found := float(value)):
@@ -38,7 +45,9 @@ def number(value: Any) -> float:
 
 
 def whole(value: Any, least: int, most: int) -> int:
-    """A whole number that is written as one. Raises ValueError on anything else, and outside least...most."""
+    """A whole number that is written as one. Raises ValueError on anything else, and outside
+    least...most.
+    """
     if type(value) is not int or not least <= value <= most:
         raise ValueError(f"{shortened(value)} is no whole number in {least}...{most}")
     return value
@@ -46,22 +55,34 @@ def whole(value: Any, least: int, most: int) -> int:
 
 def shortened(value: Any) -> str:
     """A value as a message repeats it: on one line, and not all of a long one."""
-    text = f"{value:.6g}" if isinstance(value, float) else repr(value) if isinstance(value, (str, bool)) else ""
+    text = (
+        f"{value:.6g}"
+        if isinstance(value, float)
+        else repr(value)
+        if isinstance(value, (str, bool))
+        else ""
+    )
     text = text or type(value).__name__
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 def read_rows(path: Path) -> list[list[str]]:
     """The words of each line that has any. Raises InputError."""
-    return [words for line in read_text(path, largest=LARGEST).splitlines() if (words := line.split())]
+    return [
+        words for line in read_text(path, largest=LARGEST).splitlines() if (words := line.split())
+    ]
 
 
 def read_matrix(path: Path) -> np.ndarray:
-    """A 4x4 matrix in a text file of 3 or 4 rows, as float64; a 3x3 matrix or 3x4 rows are completed. InputError."""
+    """A 4x4 matrix in a text file of 3 or 4 rows, as float64; a 3x3 matrix or 3x4 rows are
+    completed. InputError.
+    """
     try:
         rows = [[float(v) for v in row] for row in read_rows(path)]
     except ValueError as error:
-        raise InputError(f"{path} does not hold numbers ({str(error)[:LONGEST]}); restore the file") from None
+        raise InputError(
+            f"{path} does not hold numbers ({str(error)[:LONGEST]}); restore the file"
+        ) from None
     if len(rows) not in (3, 4) or {len(row) for row in rows} not in ({3}, {4}):
         raise InputError(f"{path} does not hold a 3x3 or 4x4 matrix; restore the file")
     matrix = np.eye(4)
@@ -70,8 +91,13 @@ def read_matrix(path: Path) -> np.ndarray:
 
 
 def skew_note(path: Path, K: np.ndarray) -> list[str]:
-    """A note on the skew of a matrix of intrinsics, which no camera here has; none where there is none to speak of."""
-    told = f"{path.name} has a skew of {K[0, 1]:g} pixels, which is not used: pixels are taken as rectangular."
+    """A note on the skew of a matrix of intrinsics, which no camera here has; none where there is
+    none to speak of.
+    """
+    told = (
+        f"{path.name} has a skew of {K[0, 1]:g} pixels, which is not used: pixels are taken as "
+        "rectangular."
+    )
     return [told] if abs(K[0, 1]) > LEAST_SKEW else []
 
 
@@ -79,7 +105,10 @@ def read_table(path: Path, remedy: str) -> list[dict[str, str]]:
     """Rows of a tab-separated table by the names of its first line. Raises InputError."""
     try:
         return list(
-            csv.DictReader(io.StringIO(read_text(path, remedy, largest=LARGEST // 4), newline=""), delimiter="\t")
+            csv.DictReader(
+                io.StringIO(read_text(path, remedy, largest=LARGEST // 4), newline=""),
+                delimiter="\t",
+            )
         )
     except csv.Error as error:
         raise InputError(f"{path} is no table ({error}); {remedy}") from None

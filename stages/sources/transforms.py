@@ -25,7 +25,15 @@ SPLITS = ("train_filenames", "test_filenames", "val_filenames")
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # as COLMAP's FULL_OPENCV orders them
 NERFSTUDIO = ("k1", "k2", "k3", "k4", "p1", "p2")  # of distortion_params
 # subsets of FULL_OPENCV, and of OPENCV_FISHEYE
-PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "FULL_OPENCV")
+PERSPECTIVE = (
+    "OPENCV",
+    "PINHOLE",
+    "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "PERSPECTIVE",
+    "FULL_OPENCV",
+)
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 READ = {*PARTS, *SPLITS, *DISTORTION, "distortion_params", "transform_matrix", "camera_model", "is_fisheye", "fl_x",
         "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "ply_file_path"}  # fmt: skip
@@ -36,7 +44,9 @@ OPENGL = np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backward -> y down, z forwa
 
 
 class Entry(NamedTuple):
-    """A frame: the document that lists it, and its values, those that all frames share among them."""
+    """A frame: the document that lists it, and its values, those that all frames share among
+    them.
+    """
 
     origin: Path
     values: dict[str, Any]
@@ -45,8 +55,9 @@ class Entry(NamedTuple):
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
     """The fields of a capture; its labels are those of maps beside the document (`labels.give`).
 
-    Choices: the points of `ply_file_path` are taken unless there is depth, which gives more. Test views are those of
-      nerfstudio's lists (test and validation), or of transforms_test.json, of transforms_val.json where there is none.
+    Choices: the points of `ply_file_path` are taken unless there is depth, which gives more. Test
+      views are those of nerfstudio's lists (test and validation), or of transforms_test.json, of
+      transforms_val.json where there is none.
     """
     entries = _entries(folder)
     listing = _listing(folder, entries)
@@ -56,10 +67,15 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
     if cloud is not None and "depth" not in fields:
         points, colors = read_cloud(cloud)
         if len(points) < LEAST:
-            fields["source"]["notes"].append(f"{cloud.name} holds {len(points)} points, too few: it is not used.")
+            fields["source"]["notes"].append(
+                f"{cloud.name} holds {len(points)} points, too few: it is not used."
+            )
         else:
             kept = ~assembly.in_empty_space(points, fields, listing)
-            fields |= {"points": points[kept], "point_colors": None if colors is None else colors[kept]}
+            fields |= {
+                "points": points[kept],
+                "point_colors": None if colors is None else colors[kept],
+            }
     if tests is not None:
         assembly.give_split(fields, tests, origin)
     return fields
@@ -76,18 +92,34 @@ def probe(folder: Path) -> dict[str, bool]:
 
 
 def files(folder: Path) -> list[Path]:
-    """The JSON, the points, label maps and their names, and every image, depth and mask of a frame that is on disk."""
+    """The JSON, the points, label maps and their names, and every image, depth and mask of a frame
+    that is on disk.
+    """
     entries = _entries(folder)
     present, _ = _present(folder, entries)
-    beside = [path for entry, _ in present for part in PARTS[1:] if (path := _part(folder, entry, part))]
+    beside = [
+        path for entry, _ in present for part in PARTS[1:] if (path := _part(folder, entry, part))
+    ]
     beside += [sure for path in beside if (sure := common.sureness(path))]
     cloud = _cloud(folder, entries[0])
-    beside += [*labels.files(folder), *(folder / name for name in labels.DOCUMENTS if common.present(folder / name))]
-    return sorted([*_documents(folder), *(Path(image) for _, image in present), *beside, *([cloud] if cloud else [])])
+    beside += [
+        *labels.files(folder),
+        *(folder / name for name in labels.DOCUMENTS if common.present(folder / name)),
+    ]
+    return sorted(
+        [
+            *_documents(folder),
+            *(Path(image) for _, image in present),
+            *beside,
+            *([cloud] if cloud else []),
+        ]
+    )
 
 
 def _documents(folder: Path) -> list[Path]:
-    """transforms.json; otherwise those of training views and, of the first that there are, of test views."""
+    """transforms.json; otherwise those of training views and, of the first that there are, of test
+    views.
+    """
     one, *parts = [folder / name for name in NAMES]
     if common.present(one) or not (found := [path for path in parts if common.present(path)]):
         return [one]
@@ -101,7 +133,9 @@ def _document(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path} lists no frames; write it again")
     for entry in entries:
-        if not isinstance(entry, dict) or not all(isinstance(entry.get(part, ""), str) for part in PARTS):
+        if not isinstance(entry, dict) or not all(
+            isinstance(entry.get(part, ""), str) for part in PARTS
+        ):
             raise InputError(f"{path}: a frame is no object with paths as text; write it again")
         if not entry.get("file_path") or "transform_matrix" not in entry:
             raise InputError(f"{path}: a frame lacks file_path or transform_matrix; write it again")
@@ -121,23 +155,38 @@ def _present(folder: Path, entries: list[Entry]) -> tuple[list[tuple[Entry, str]
     """(entry, image) of the frames that are on disk; the paths of those that are not.
 
     Raises: InputError if a path leads out of the folder, and no photo in it is meant.
-    Choices: a photo that is not where it is listed, or was on another machine, is one of the others, of this name alone
-      (`common.matched`).
+    Choices: a photo that is not where it is listed, or was on another machine, is one of the
+      others, of this name alone (`common.matched`).
     """
     paths = [_below(folder, entry.values["file_path"]) for entry in entries]
-    images = {path: image for path in paths if not _leads_out(path) and (image := _on_disk(os.path.join(folder, path)))}
+    images = {
+        path: image
+        for path in paths
+        if not _leads_out(path) and (image := _on_disk(os.path.join(folder, path)))
+    }
     if absent := [path for path in paths if path not in images]:
-        taken = {*images.values(), *(str(_part(folder, entry, part)) for entry in entries for part in PARTS[1:])}
+        taken = {
+            *images.values(),
+            *(str(_part(folder, entry, part)) for entry in entries for part in PARTS[1:]),
+        }
         others = [
             name
             for name in common.names_below(folder)
-            if name.partition("/")[0] not in common.BESIDE and os.path.join(folder, name) not in taken
+            if name.partition("/")[0] not in common.BESIDE
+            and os.path.join(folder, name) not in taken
         ]
-        images |= {path: os.path.join(folder, name) for path, name in common.matched(absent, others).items()}
+        images |= {
+            path: os.path.join(folder, name)
+            for path, name in common.matched(absent, others).items()
+        }
     present, absent = [], []
     for entry, path in zip(entries, paths, strict=True):
         image = images.get(path)
-        inside = os.path.relpath(image, folder) if image and _leads_out(path) else _inside(folder, entry, path)
+        inside = (
+            os.path.relpath(image, folder)
+            if image and _leads_out(path)
+            else _inside(folder, entry, path)
+        )
         if image is None:
             absent.append(inside)
         else:
@@ -148,13 +197,22 @@ def _present(folder: Path, entries: list[Entry]) -> tuple[list[tuple[Entry, str]
 def _on_disk(path: str) -> str | None:
     """The file itself, or with an image suffix where the listing leaves it away."""
     paths = [path + end for end in ("", ".png", ".jpg", ".jpeg")]
-    return next((p for p in paths if os.path.isfile(p) or (is_image(os.path.basename(p)) and os.path.lexists(p))), None)
+    return next(
+        (
+            p
+            for p in paths
+            if os.path.isfile(p) or (is_image(os.path.basename(p)) and os.path.lexists(p))
+        ),
+        None,
+    )
 
 
 def _below(folder: Path, listed: str) -> str:
     """A listed path relative to the folder, which may lead out of it."""
     path = listed.replace("\\", "/")
-    return os.path.normpath(os.path.relpath(path, os.path.abspath(folder)) if os.path.isabs(path) else path)
+    return os.path.normpath(
+        os.path.relpath(path, os.path.abspath(folder)) if os.path.isabs(path) else path
+    )
 
 
 def _leads_out(path: str) -> bool:
@@ -165,7 +223,9 @@ def _inside(folder: Path, entry: Entry, listed: str) -> str:
     """A listed path relative to the folder. Raises InputError if it leads out of it."""
     path = _below(folder, listed)
     if _leads_out(path):
-        raise InputError(f"{entry.origin}: {listed} lies elsewhere; write paths relative to the folder")
+        raise InputError(
+            f"{entry.origin}: {listed} lies elsewhere; write paths relative to the folder"
+        )
     return next(common.printable(entry.origin, [path]))
 
 
@@ -182,7 +242,9 @@ def _name(path: str) -> str:
 def _cloud(folder: Path, first: Entry) -> Path | None:
     """The points that the document names, if they are there."""
     listed = first.values.get("ply_file_path")
-    if not isinstance(listed, str) or not common.present(path := folder / _inside(folder, first, listed)):
+    if not isinstance(listed, str) or not common.present(
+        path := folder / _inside(folder, first, listed)
+    ):
         return None
     return path
 
@@ -196,11 +258,17 @@ def _listing(folder: Path, entries: list[Entry]) -> Listing:
         try:
             matrix = np.array(entry.values["transform_matrix"])
         except ValueError as error:  # ragged, or nested more deeply than arrays can be
-            raise InputError(f"{path}: {name} has no usable transform_matrix ({error}); write it again") from None
+            raise InputError(
+                f"{path}: {name} has no usable transform_matrix ({error}); write it again"
+            ) from None
         if matrix.dtype.kind not in "iuf":
-            raise InputError(f"{path}: transform_matrix of {name} does not hold numbers; write it again")
+            raise InputError(
+                f"{path}: transform_matrix of {name} does not hold numbers; write it again"
+            )
         if matrix.shape not in ((3, 4), (4, 4)):
-            raise InputError(f"{path}: transform_matrix of {name} is {matrix.shape}, not (4, 4); write it again")
+            raise InputError(
+                f"{path}: transform_matrix of {name} is {matrix.shape}, not (4, 4); write it again"
+            )
         matrices.append(np.vstack([matrix, [0, 0, 0, 1]])[:4] * OPENGL)
     poses = cameras.cam_from_world(entries[0].origin, np.reshape(matrices, (-1, 4, 4)), names)
     frames = []
@@ -214,11 +282,20 @@ def _listing(folder: Path, entries: list[Entry]) -> Listing:
         total = len(absent) + len(present)
         notes.append(f"{len(absent)} of {total} listed frames are absent on disk ({few(absent)}).")
         used = {image for _, image in present}
-        there = [name for name in common.names_below(folder) if name.partition("/")[0] not in common.BESIDE]
+        there = [
+            name
+            for name in common.names_below(folder)
+            if name.partition("/")[0] not in common.BESIDE
+        ]
         if others := [name for name in there if os.path.join(folder, name) not in used]:
             notes.append(f"Images that no frame lists: {few(others)}.")
-    if elsewhere := sum(frame.name != _name(os.path.relpath(frame.image, folder)) for frame in frames):
-        notes.append(f"{elsewhere} photos have another path on disk than is listed, and are told by their names.")
+    if elsewhere := sum(
+        frame.name != _name(os.path.relpath(frame.image, folder)) for frame in frames
+    ):
+        notes.append(
+            f"{elsewhere} photos have another path on disk than is listed, and are told "
+            "by their names."
+        )
     listing = Listing("transforms", frames, notes=notes + _unused(folder, entries, frames))
     labels.give(listing, folder)
     return listing
@@ -240,7 +317,9 @@ def _unused(folder: Path, entries: list[Entry], frames: list[Frame]) -> list[str
 
 
 def _split(folder: Path, entries: list[Entry], listing: Listing) -> tuple[set[str] | None, str]:
-    """Names of the test views and what says so, None where nothing does; frames of no list leave the listing."""
+    """Names of the test views and what says so, None where nothing does; frames of no list leave
+    the listing.
+    """
     documents = _documents(folder)
     if len(documents) == 2:
         held = [entry for entry, _ in _present(folder, entries)[0] if entry.origin == documents[1]]
@@ -261,17 +340,28 @@ def _split(folder: Path, entries: list[Entry], listing: Listing) -> tuple[set[st
         return names - train, "train_filenames"
     if train and (outside := names - train.union(*tests)):
         listing.frames = [frame for frame in listing.frames if frame.name not in outside]
-        listing.notes.append(f"{len(outside)} frames are in no list of {documents[0].name} and are left out.")
+        listing.notes.append(
+            f"{len(outside)} frames are in no list of {documents[0].name} and are left out."
+        )
     return set().union(*tests), " and ".join(key for key in SPLITS[1:] if key in lists)
 
 
 def _camera(values: dict[str, Any], image: Path, path: Path) -> Camera:
-    """The camera of one frame. Raises InputError on a lens that is not supported, or no focal length."""
+    """The camera of one frame. Raises InputError on a lens that is not supported, or no focal
+    length.
+    """
     named = values.get("camera_model")
-    model = "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV" if named is None else shortened(named).strip("'")
+    model = (
+        "OPENCV_FISHEYE"
+        if values.get("is_fisheye")
+        else "OPENCV"
+        if named is None
+        else shortened(named).strip("'")
+    )
     if model not in PERSPECTIVE + FISHEYE:
         raise InputError(
-            f"{path}: camera_model {model} is not supported ({', '.join(PERSPECTIVE + FISHEYE)} are); undistort the "
+            f"{path}: camera_model {model} is not supported ({', '.join(PERSPECTIVE + FISHEYE)} "
+            "are); undistort the "
             "photos first, for example with `colmap image_undistorter`"
         )
     size = (values["w"], values["h"]) if "w" in values and "h" in values else header(image)[0]
@@ -284,7 +374,9 @@ def _camera(values: dict[str, Any], image: Path, path: Path) -> Camera:
         if "distortion_params" in values:
             k |= dict(zip(NERFSTUDIO, map(number, values["distortion_params"]), strict=True))
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: intrinsics are no numbers that can be used ({error}); write it again") from None
+        raise InputError(
+            f"{path}: intrinsics are no numbers that can be used ({error}); write it again"
+        ) from None
     if fx is None or fy is None:
         raise InputError(f"{path} has neither fl_x nor camera_angle_x; write it again")
     given = {key for key, value in k.items() if value}
@@ -292,16 +384,20 @@ def _camera(values: dict[str, Any], image: Path, path: Path) -> Camera:
     used: tuple[str, ...] = DISTORTION
     if model in FISHEYE:
         kind, used = "OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")
-    elif model != "FULL_OPENCV":  # whose k4 is OpenCV's; nerfstudio means another, which it does not undo either
+    # whose k4 is OpenCV's; nerfstudio means another, which it does not undo either
+    elif model != "FULL_OPENCV":
         used = DISTORTION[:5]
         kind = "FULL_OPENCV" if "k3" in given else "OPENCV" if given else "PINHOLE"
     if beyond := sorted(given - set(used)):
         raise InputError(
-            f"{path}: {beyond[0]} of a camera {model} is not supported; write FULL_OPENCV if it is OpenCV's, or "
+            f"{path}: {beyond[0]} of a camera {model} is not supported; write FULL_OPENCV if it "
+            "is OpenCV's, or "
             "undistort the photos first"
         )
     lens = [k[key] for key in (used if model in FISHEYE else DISTORTION)]
-    return cameras.camera_of(path, kind, (fx, fy, *centre, *lens)[: cameras.MODELS[kind]], width, height)
+    return cameras.camera_of(
+        path, kind, (fx, fy, *centre, *lens)[: cameras.MODELS[kind]], width, height
+    )
 
 
 def _focal(values: dict[str, Any], axis: str, pixels: float) -> float | None:

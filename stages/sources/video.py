@@ -1,4 +1,6 @@
-"""The video source: one file, or a folder that holds one and no photos. Poses come from the stage `pose`."""
+"""The video source: one file, or a folder that holds one and no photos. Poses come from the stage
+`pose`.
+"""
 
 from __future__ import annotations
 
@@ -22,35 +24,46 @@ from chebsplat.stages.sources.colmap_model import Cloud
 from chebsplat.stages.sources.common import Shot, file_of
 
 MOST, LEAST = 150, 3  # frames: where pose.max_views says nothing, and that a scene needs
-SIDE, THUMBNAIL = 640, 192  # pixels of the longer side, on which sharpness and movement are measured
+# pixels of the longer side, on which sharpness and movement are measured
+SIDE, THUMBNAIL = 640, 192
 
 
-def shots(path: Path, settings: PoseSection, shown: Progress | None, finer: int) -> tuple[list[Shot], list[str]]:
+def shots(
+    path: Path, settings: PoseSection, shown: Progress | None, finer: int
+) -> tuple[list[Shot], list[str]]:
     """The frames to pose, named by their time in seconds, and notes about them.
 
     Args:    finer: so many frames in place of one.
-    Raises:  InputError where the video cannot be read; DataFailure where its picture hardly moves; ConfigError where it
+    Raises:  InputError where the video cannot be read; DataFailure where its picture hardly moves;
+      ConfigError where it
              is asked to show all directions.
     Choices: the file is decoded anew whenever frames are taken, since they do not fit into memory.
     """
     (file,) = files(path)
     if settings.camera == cameras.EQUIRECTANGULAR:
-        raise ConfigError("pose.camera EQUIRECTANGULAR is of photos: take frames of the video as photos")
+        raise ConfigError(
+            "pose.camera EQUIRECTANGULAR is of photos: take frames of the video as photos"
+        )
     video = videos.describe(file)
     times, sharpness, moves = _measured(file, video, shown)
     at_most = settings.max_views or finer * MOST
     taken = choose(progress(moves, STEP / finer), sharpness, at_most)
     if len(taken) < LEAST:
         raise DataFailure(
-            f"{file}: its picture moves by {progress(moves)[-1]:.1f} steps of 7.5 % of its width, which gives "
+            f"{file}: its picture moves by {progress(moves)[-1]:.1f} steps of 7.5 % of its width, "
+            "which gives "
             f"{len(taken)} views; {LEAST} are needed: walk around what is filmed"
         )
     notes = [
-        f"{len(taken)} of {len(times)} frames are used, one for each time that the picture moves by "
+        f"{len(taken)} of {len(times)} frames are used, one for each time that the picture moves "
+        "by "
         f"{STEP / finer:.1%} of its width, or fewer: at most {at_most} (pose.max_views)."
     ]
     if video.hdr:
-        notes.append("The video is HDR, and its colours are read as they are coded: film in SDR, or convert it.")
+        notes.append(
+            "The video is HDR, and its colours are read as they are coded: film in SDR, "
+            "or convert it."
+        )
     size = video.width, video.height
     return [Shot(f"{times[k]:08.3f}", file, size, frame=int(k)) for k in taken], notes
 
@@ -65,7 +78,9 @@ def save(found: Sequence[Shot], _: Path, pictures: Path, max_side: int) -> None:
 
 
 def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, Any]:
-    """The fields of a capture: the frames of a model, without what the lens bends, and its points."""
+    """The fields of a capture: the frames of a model, without what the lens bends, and its
+    points.
+    """
     (file,) = files(path)
     camera = cameras.camera_of(file, *model.cameras[0])
     view = assembly.geometry(camera, settings.max_side)
@@ -97,7 +112,9 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
         "altered": altered,
         "variance_kept": float(np.mean(kept)),
     }
-    return fields | points_of(Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields)
+    return fields | points_of(
+        Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields
+    )
 
 
 def probe(path: Path) -> dict[str, bool]:
@@ -111,17 +128,26 @@ def files(path: Path) -> list[Path]:
         return [path]
     found = sorted(name for name in os.listdir(path) if videos.is_video(name))
     if len(found) != 1:
-        raise InputError(f"{path} holds {len(found)} videos, one is read at a time; name its file as scene=")
+        raise InputError(
+            f"{path} holds {len(found)} videos, one is read at a time; name its file as scene="
+        )
     return [path / found[0]]
 
 
-def _measured(file: Path, video: videos.Video, shown: Progress | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each frame its time in s [F], its sharpness [F] and the moves of its blocks [F, B, 2] in widths."""
+def _measured(
+    file: Path, video: videos.Video, shown: Progress | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each frame its time in s [F], its sharpness [F] and the moves of its blocks [F, B, 2] in
+    widths.
+    """
     times: list[float | None] = []
     sharpness, moves, before = [], [], None
     frames: Any = videos.frames(file)
     if shown is not None:
-        frames = (item for item, _ in shown.track(frames, lambda: max(video.n_frames, len(times)), "frames"))
+        frames = (
+            item
+            for item, _ in shown.track(frames, lambda: max(video.n_frames, len(times)), "frames")
+        )
     for frame in frames:
         small = _thumbnail(frame.pixels(THUMBNAIL))
         found = shifts(small if before is None else before, small)

@@ -19,21 +19,27 @@ from chebsplat.stages.sources import labels, texts
 
 
 def give(fields: dict[str, Any], path: Path) -> None:
-    """Give the fields of a capture the labels of the volumes that hold what its pixels show, -1 where
-    none does or depth is unknown.
+    """Give the fields of a capture the labels of the volumes that hold what its pixels show, -1
+    where none does or depth is unknown.
 
     Raises: ConfigError where the source has no depth with poses, InputError naming the file.
     """
     if fields.get("depth") is None or fields.get("cam_from_world") is None:
-        raise ConfigError("ingest.volumes needs depth with poses, which this source lacks; leave it away")
+        raise ConfigError(
+            "ingest.volumes needs depth with poses, which this source lacks; leave it away"
+        )
     frame, margin, names, volumes = read(path)
     raw = np.full(fields["depth"].shape, -1, np.int32)
     for view, depth in enumerate(fields["depth"]):
         pixels = np.argwhere(np.isfinite(depth))
         points = unproject(depth, fields["Ks"][view], fields["cam_from_world"][view], pixels)
         raw[view][tuple(pixels.T)] = holder(points @ frame[:, :3].T + frame[:, 3], volumes, margin)
-    fields["labels"], fields["class_names"], notes = labels.indexed(raw, dict(enumerate(names)), None)
-    fields["source"]["labels"] = f"Labels are of the {len(volumes)} volumes of {path.name}, by depth."
+    fields["labels"], fields["class_names"], notes = labels.indexed(
+        raw, dict(enumerate(names)), None
+    )
+    fields["source"]["labels"] = (
+        f"Labels are of the {len(volumes)} volumes of {path.name}, by depth."
+    )
     fields["source"]["notes"] += notes
 
 

@@ -1,4 +1,6 @@
-"""A teacher's image encoder in ONNX, `[1, 3, H, W]` float32 -> `[1, C, h, w]`: windows, scales and flips of a view."""
+"""A teacher's image encoder in ONNX, `[1, 3, H, W]` float32 -> `[1, C, h, w]`: windows, scales and
+flips of a view.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ MAX_SHARE = 0.5  # of the image's side that an entry of the map may be wide
 
 
 class TeacherInference:
-    """Runs one teacher, one window at a time: on a CPU a batch gains nothing, and memory stays that of one window.
+    """Runs one teacher, one window at a time: on a CPU a batch gains nothing, and memory stays that
+    of one window.
 
     scores: what the values of a segmenter are, once `judge` has seen some.
     Args: threads: that onnxruntime may use; device: cpu, or cuda where onnxruntime has it.
@@ -37,7 +40,8 @@ class TeacherInference:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         options.use_deterministic_compute = True
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # leave the cores to others
+        # leave the cores to others
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         remedy = f"correct `size` or `multiple` in {teacher.settings}, or export it again"
         self.model = Model(teacher.path, remedy, options, device)
         self.size = self._window_size()
@@ -50,19 +54,29 @@ class TeacherInference:
         path, entries = self.teacher.path, self.model.inputs
         shape, kind = list(entries[0].shape), entries[0].type
         if len(entries) != 1:
-            raise InputError(f"{path} has {len(entries)} inputs; one image [1, 3, H, W] is needed: export it again")
+            raise InputError(
+                f"{path} has {len(entries)} inputs; one image [1, 3, H, W] is "
+                "needed: export it again"
+            )
         if len(shape) != 4 or ((isinstance(shape[1], int) or shape[3] == 3) and shape[1] != 3):
-            raise InputError(f"{path} takes {shape}; one image [1, 3, H, W] is needed: export it again")
+            raise InputError(
+                f"{path} takes {shape}; one image [1, 3, H, W] is needed: export it again"
+            )
         if kind != "tensor(float)":
-            raise InputError(f"{path} takes {kind}; export it with a float32 input (weights may be float16)")
+            raise InputError(
+                f"{path} takes {kind}; export it with a float32 input (weights may be float16)"
+            )
         fixed = tuple(side for side in shape[2:] if isinstance(side, int))
         if max(fixed, default=0) > MAX_SIDE:
-            raise InputError(f"{path} takes {list(fixed)}; sides up to {MAX_SIDE} pixels are possible")
+            raise InputError(
+                f"{path} takes {list(fixed)}; sides up to {MAX_SIDE} pixels are possible"
+            )
         if len(fixed) < 2:
             return self.teacher.size
         if self.teacher.size not in (None, fixed):
             raise InputError(
-                f"{path} takes {list(fixed)}, {self.teacher.settings} says size = {list(self.teacher.size or ())}; "
+                f"{path} takes {list(fixed)}, {self.teacher.settings} says size = "
+                f"{list(self.teacher.size or ())}; "
                 "correct it"
             )
         return fixed[0], fixed[1]
@@ -74,53 +88,70 @@ class TeacherInference:
         size = max(round(height * factor), 1), max(round(width * factor), 1)
         if max(size) > MAX_SIDE:
             raise InputError(
-                f"{self.teacher.settings}: an image of {size[1]} x {size[0]} is beyond {MAX_SIDE} pixels a side; lower "
+                f"{self.teacher.settings}: an image of {size[1]} x {size[0]} is beyond {MAX_SIDE} "
+                "pixels a side; lower "
                 "`base` or teacher.scales"
             )
         return size
 
     def window(self, size: tuple[int, int]) -> tuple[int, int]:
-        """What the model is fed of an image of a size: the model's size, or the image's own up to a multiple."""
+        """What the model is fed of an image of a size: the model's size, or the image's own up to a
+        multiple.
+        """
         if self.size is not None:
             return self.size
-        height, width = (math.ceil(side / self.teacher.multiple) * self.teacher.multiple for side in size)
+        height, width = (
+            math.ceil(side / self.teacher.multiple) * self.teacher.multiple for side in size
+        )
         return height, width
 
     def grid(self, image: np.ndarray, downscale: int) -> tuple[tuple[int, int], int]:
         """((h, w), C): entries of a view's map, and the encoder's channels.
 
-        Choices: an entry is `downscale` pixels of the view wide, or as wide as the model's own at scale 1 where
-          these are wider.
+        Choices: an entry is `downscale` pixels of the view wide, or as wide as the model's own at
+          scale 1 where these are wider.
         """
         scaled = self.scaled_size(image, 1.0)
         side = self.window(scaled)
         count = math.prod(len(window_starts(n, m)) for n, m in zip(scaled, side, strict=True))
         if count > MAX_WINDOWS or max(side) > MAX_SIDE:
             raise InputError(
-                f"{self.teacher.settings}: a view takes {count:,} windows of {side[1]} x {side[0]}; {MAX_WINDOWS:,} of "
+                f"{self.teacher.settings}: a view takes {count:,} windows of {side[1]} x "
+                f"{side[0]}; {MAX_WINDOWS:,} of "
                 f"sides up to {MAX_SIDE} are possible: correct `base`, `size` or `multiple`"
             )
-        cells = self.run(_padded(self._resized(image, scaled), side)[: side[0], : side[1]], "the first view")
+        cells = self.run(
+            _padded(self._resized(image, scaled), side)[: side[0], : side[1]], "the first view"
+        )
         sides = []
         for n, m, window, count in zip(image.shape[:2], scaled, side, cells.shape[1:], strict=True):
             entry = max(window / count * n / m, downscale)
             if entry > MAX_SHARE * n:
                 raise InputError(
-                    f"{self.teacher.path} gives one feature every {entry:.0f} pixels, for views of {n}; give larger "
+                    f"{self.teacher.path} gives one feature every {entry:.0f} pixels, for views "
+                    f"of {n}; give larger "
                     f"images, or `base` in {self.teacher.settings}"
                 )
             sides.append(math.ceil(n / entry - 1e-9))
         return (sides[0], sides[1]), cells.shape[0]
 
     def judge(self, images: Stack | list[np.ndarray]) -> None:
-        """Tell from a few of the images what a segmenter's values are; all later maps are read so."""
+        """Tell from a few of the images what a segmenter's values are; all later maps are read
+        so.
+        """
         few = images[:: -(-len(images) // JUDGED)]
         self.scores = kind_of([self.run(self.middle(image), "a view") for image in few])
         if self.scores != LOGITS:
-            log.info("%s gives values of %s, not logits: taken as such", self.teacher.path.name, self.scores)
+            log.info(
+                "%s gives values of %s, not logits: taken as such",
+                self.teacher.path.name,
+                self.scores,
+            )
 
     def middle(self, image: np.ndarray, side: tuple[int, int] | None = None) -> np.ndarray:
-        """The window in an image's middle, u8 [H, W, 3]. Args: side: its (H, W); None: the usual."""
+        """The window in an image's middle, u8 [H, W, 3]. Args: side: its (H, W); None: the
+        usual.
+        """
         size = self.scaled_size(image, 1.0)
         side = side or self.window(size)
         resized = self._resized(image, size)
@@ -128,12 +159,19 @@ class TeacherInference:
         return _padded(resized[top : top + side[0], left : left + side[1]], side)
 
     def features(
-        self, image: np.ndarray, grid: tuple[int, int], scales: tuple[float, ...], flips: bool, name: str
+        self,
+        image: np.ndarray,
+        grid: tuple[int, int],
+        scales: tuple[float, ...],
+        flips: bool,
+        name: str,
     ) -> np.ndarray:
-        """The map f32 [h, w, C] of a view, u8 [H, W, 3]: unit features, or probabilities of a closed set.
+        """The map f32 [h, w, C] of a view, u8 [H, W, 3]: unit features, or probabilities of a
+        closed set.
 
-        Choices: every window's entries are unit (or probabilities) before windows are blended; every scale's and flip's
-          map counts the same in the mean, which is made unit again. Padding repeats the image's edge.
+        Choices: every window's entries are unit (or probabilities) before windows are blended;
+          every scale's and flip's map counts the same in the mean, which is made unit again.
+          Padding repeats the image's edge.
         """
         total = np.zeros(0)
         for scale in scales:
@@ -142,7 +180,9 @@ class TeacherInference:
             for flip in (False, True) if flips else (False,):
                 padded = _padded(resized[:, ::-1] if flip else resized, side)
 
-                def entries(top: int, left: int, padded: Any = padded, side: Any = side) -> np.ndarray:
+                def entries(
+                    top: int, left: int, padded: Any = padded, side: Any = side
+                ) -> np.ndarray:
                     output = self.run(padded[top : top + side[0], left : left + side[1]], name)
                     if self.teacher.output == "logits":
                         return probabilities(output, self.scores)
@@ -154,12 +194,18 @@ class TeacherInference:
         return self._normal(total)
 
     def _normal(self, values: np.ndarray) -> np.ndarray:
-        return values / values.sum(-1, keepdims=True) if self.teacher.output == "logits" else unit(values, -1)
+        return (
+            values / values.sum(-1, keepdims=True)
+            if self.teacher.output == "logits"
+            else unit(values, -1)
+        )
 
     def run(self, window: np.ndarray, name: str) -> np.ndarray:
-        """The model's output f32 [C, h, w] for one window u8 [H, W, 3]. `name` of the view is for errors.
+        """The model's output f32 [C, h, w] for one window u8 [H, W, 3]. `name` of the view is for
+        errors.
 
-        Raises: InputError on a model that does not run or gives another rank; DataFailure on non-finite values.
+        Raises: InputError on a model that does not run or gives another rank; DataFailure on
+          non-finite values.
         """
         teacher = self.teacher
         mean, std = (np.array(v, np.float32)[:, None, None] for v in (teacher.mean, teacher.std))
@@ -170,13 +216,20 @@ class TeacherInference:
             self._place, self._last = self._place_of(outputs)
         output = outputs[self._place]
         if output.dtype.kind in "iu" and (output.ndim == 3 or output.shape[1:2] == (1,)):
-            raise InputError(f"{teacher.path} gives the likeliest class alone, {list(output.shape)}; export its logits")
+            raise InputError(
+                f"{teacher.path} gives the likeliest class alone, "
+                f"{list(output.shape)}; export its logits"
+            )
         if output.ndim != 4 or output.shape[0] != 1 or not output.size:
-            raise InputError(f"{teacher.path} gives {list(output.shape)}; [1, C, h, w] is needed: export it again")
+            raise InputError(
+                f"{teacher.path} gives {list(output.shape)}; [1, C, h, w] is needed: "
+                "export it again"
+            )
         output = np.moveaxis(output, 3, 1) if self._last else output
         if not np.isfinite(output).all():
             raise DataFailure(
-                f"{teacher.path} gives {np.sum(~np.isfinite(output))} non-finite values for {name}; check mean and std "
+                f"{teacher.path} gives {np.sum(~np.isfinite(output))} non-finite values for "
+                f"{name}; check mean and std "
                 f"in {teacher.settings}, and export it in float32"
             )
         return output[0].astype(np.float32)
@@ -195,28 +248,41 @@ class TeacherInference:
         """
         teacher = self.teacher
         names = [entry.name for entry in self.model.outputs]
-        listed = ", ".join(f"{name} {list(value.shape)}" for name, value in zip(names, outputs, strict=True))
+        listed = ", ".join(
+            f"{name} {list(value.shape)}" for name, value in zip(names, outputs, strict=True)
+        )
         asked = [k for k, name in enumerate(names) if teacher.tensor in (None, name)]
         if not asked:
             why = f"no output is called {teacher.tensor}: there are {listed}"
             raise InputError(f"{teacher.settings}: {why}; correct `tensor`")
-        maps = [k for k in asked if outputs[k].ndim == 4 and len(outputs[k]) == 1 and outputs[k].size]
-        table, embeddings = ([], None) if teacher.labels is None else read_label_table(teacher.labels)
+        maps = [
+            k for k in asked if outputs[k].ndim == 4 and len(outputs[k]) == 1 and outputs[k].size
+        ]
+        table, embeddings = (
+            ([], None) if teacher.labels is None else read_label_table(teacher.labels)
+        )
         n_channels = None if embeddings is None else embeddings.shape[1]
         if teacher.output == "logits":
             n_channels = len(table)
-        first, last = ([k for k in maps if n_channels in (None, outputs[k].shape[axis])] for axis in (1, 3))
+        first, last = (
+            [k for k in maps if n_channels in (None, outputs[k].shape[axis])] for axis in (1, 3)
+        )
         found = first or last
         if len(found) == 1:
             if not first:
-                log.info("%s gives %s: channels come last, and are taken so", teacher.path.name, listed)
+                log.info(
+                    "%s gives %s: channels come last, and are taken so", teacher.path.name, listed
+                )
             elif len(asked) > 1:
                 log.info("%s gives %s: %s is taken", teacher.path.name, listed, names[found[0]])
             return found[0], not first
         if len(asked) == 1:  # which whoever needs the channels refuses
             return asked[0], False
         fit = f"{'more than one' if found else 'none'} fits {teacher.labels or '[1, C, h, w]'}"
-        raise InputError(f"{teacher.path} gives {listed}: {fit}; name the right one as `tensor` in {teacher.settings}")
+        raise InputError(
+            f"{teacher.path} gives {listed}: {fit}; name the right one as `tensor` "
+            f"in {teacher.settings}"
+        )
 
 
 def unit(values: np.ndarray, axis: int) -> np.ndarray:

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from chebsplat.formats.channels import ChannelMap
     from chebsplat.formats.teacher_model import TeacherModel
 
-IN_ROOMS = (  # what rooms commonly hold: asked for where neither the source nor the user names classes
+# what rooms commonly hold: asked for where neither the source nor the user names classes
+IN_ROOMS = (
     "wall", "floor", "ceiling", "window", "door", "curtain", "blind", "rug", "table", "desk", "chair", "armchair",
     "sofa", "stool", "bed", "cabinet", "wardrobe", "chest of drawers", "shelf", "bookcase", "counter", "lamp",
     "picture", "mirror", "clock", "plant", "vase", "cushion", "pillow", "blanket", "towel", "basket", "bin", "box",
@@ -33,17 +34,23 @@ LEAST = 12  # of these words that a teacher knows, or else all of its own are as
 
 @dataclass
 class LabelSpace:
-    """names [L]; embeddings f32 [L, d]; `split`: map [h, w, C] -> (features [h, w, d], labels, confidence [h, w])."""
+    """names [L]; embeddings f32 [L, d]; `split`: map [h, w, C] -> (features [h, w, d], labels,
+    confidence [h, w]).
+    """
 
     names: list[str]
     embeddings: np.ndarray
     split: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
-def label_set(teacher: TeacherModel, file: str | None, class_names: list[str] | None) -> dict[str, list[str]]:
-    """Names in order with the words that mean them: of the file asked for, else of the capture, else IN_ROOMS.
+def label_set(
+    teacher: TeacherModel, file: str | None, class_names: list[str] | None
+) -> dict[str, list[str]]:
+    """Names in order with the words that mean them: of the file asked for, else of the capture,
+    else IN_ROOMS.
 
-    Choices: of IN_ROOMS those in the teacher's table, which may have thousands of nouns; all of a table with few.
+    Choices: of IN_ROOMS those in the teacher's table, which may have thousands of nouns; all of a
+      table with few.
     """
     if file:
         return read_label_set(Path(file))
@@ -51,7 +58,8 @@ def label_set(teacher: TeacherModel, file: str | None, class_names: list[str] | 
         return {name: [name] for name in class_names}
     if teacher.labels is None:
         raise ConfigError(
-            f"no labels to ask for: the capture names no classes and {teacher.settings} has no `labels`; "
+            f"no labels to ask for: the capture names no classes and {teacher.settings} has no "
+            "`labels`; "
             "give teacher.labels, a text file with one name a line"
         )
     table = read_label_table(teacher.labels)[0]
@@ -61,19 +69,24 @@ def label_set(teacher: TeacherModel, file: str | None, class_names: list[str] | 
 
 
 def open_vocabulary(
-    teacher: TeacherModel, labels: dict[str, list[str]], n_channels: int, channels: ChannelMap | None
+    teacher: TeacherModel,
+    labels: dict[str, list[str]],
+    n_channels: int,
+    channels: ChannelMap | None,
 ) -> LabelSpace:
     """The space of a teacher of `n_channels` features.
 
     Raises: InputError where embeddings or the channel map have other channels.
-    Choices: a label's vector is the mean of the unit embeddings of its words, made unit again. Labels and confidence
-      are those of the teacher's own channels.
+    Choices: a label's vector is the mean of the unit embeddings of its words, made unit again.
+      Labels and confidence are those of the teacher's own channels.
     """
     from chebsplat.stages.teacher_models.image_encoder import unit
 
     words = list(dict.fromkeys(word for group in labels.values() for word in group))
     known = dict(zip(words, unit(text_embeddings(words, teacher), -1), strict=True))
-    own = unit(np.stack([np.mean([known[word] for word in group], 0) for group in labels.values()]), -1)
+    own = unit(
+        np.stack([np.mean([known[word] for word in group], 0) for group in labels.values()]), -1
+    )
     if own.shape[1] != n_channels:
         raise InputError(
             f"{teacher.path} gives {n_channels} channels, its text embeddings have {own.shape[1]} "
@@ -81,7 +94,8 @@ def open_vocabulary(
         )
     if channels is not None and len(channels.matrix) != n_channels:
         raise InputError(
-            f"the channel map is of {len(channels.matrix)} channels ({channels.teacher}), {teacher.path} has "
+            f"the channel map is of {len(channels.matrix)} channels ({channels.teacher}), "
+            f"{teacher.path} has "
             f"{n_channels}; pass the one of this teacher"
         )
 
@@ -92,15 +106,17 @@ def open_vocabulary(
     return LabelSpace(list(labels), own if channels is None else channels.embed(own), split)
 
 
-def closed_set(teacher: TeacherModel, labels: dict[str, list[str]] | None, n_channels: int, n_codes: int) -> LabelSpace:
+def closed_set(
+    teacher: TeacherModel, labels: dict[str, list[str]] | None, n_channels: int, n_codes: int
+) -> LabelSpace:
     """The space of a segmenter with `n_channels` classes.
 
-    Args: labels: where a file was asked for: classes that are words of one label become that label; the others keep
-      their own names.
+    Args: labels: where a file was asked for: classes that are words of one label become that label;
+      the others keep their own names.
     Raises: InputError where names and channels differ in number, or a label has no class.
-    Choices: a pixel's feature is the unit mean of the class codes (`chebsplat.labels.decode`), weighted by its
-      probabilities, so that training is the same as for features; its label is the likeliest, its confidence that
-      probability.
+    Choices: a pixel's feature is the unit mean of the class codes (`chebsplat.labels.decode`),
+      weighted by its probabilities, so that training is the same as for features; its label is the
+      likeliest, its confidence that probability.
     """
     from chebsplat.stages.teacher_models.image_encoder import unit
 
@@ -108,14 +124,18 @@ def closed_set(teacher: TeacherModel, labels: dict[str, list[str]] | None, n_cha
     classes = read_label_table(teacher.labels)[0]
     if len(classes) != n_channels:
         raise InputError(
-            f"{teacher.path} gives {n_channels} channels, {teacher.labels} names {len(classes)} classes; name every "
+            f"{teacher.path} gives {n_channels} channels, {teacher.labels} names {len(classes)} "
+            "classes; name every "
             "channel in order"
         )
     label_of = {joined(word): name for name, group in (labels or {}).items() for word in group}
     named = [label_of.get(joined(word), word) for word in classes]
     absent = [name for name in labels or {} if name not in named]
     if absent:
-        raise InputError(f"no class of {teacher.labels} is called {absent[0]} or one of its synonyms; correct the file")
+        raise InputError(
+            f"no class of {teacher.labels} is called {absent[0]} or one of its "
+            "synonyms; correct the file"
+        )
     names = list(dict.fromkeys(named))
     merge = np.array([[name == of for name in names] for of in named], np.float32)
     codes = class_codes(names, n_codes)

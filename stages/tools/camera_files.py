@@ -1,7 +1,8 @@
-"""Cameras in other programs' files: COLMAP's text model, nerfstudio's transforms.json, 3DGS' cameras.json.
+"""Cameras in other programs' files: COLMAP's text model, nerfstudio's transforms.json, 3DGS'
+cameras.json.
 
-World, units and pixel centres (half integers) are those of the scene; only axes change, and only where a format has
-its own. Images are called by the view's name and .png.
+World, units and pixel centres (half integers) are those of the scene; only axes change, and only
+where a format has its own. Images are called by the view's name and .png.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ AGAIN = "write it again"
 
 
 def write_cameras(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
-    """Write cameras in the three forms: sparse/0 (COLMAP), transforms.json, cameras.json; returns what was written.
+    """Write cameras in the three forms: sparse/0 (COLMAP), transforms.json, cameras.json; returns
+    what was written.
 
     Raises: ConfigError if one of them exists.
     """
@@ -46,16 +48,24 @@ def write_cameras(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
 
 
 def colmap_texts(cameras: Sequence[Camera]) -> dict[str, str]:
-    """COLMAP's text model by file: one PINHOLE camera for each lens and size, no keypoints, no points."""
+    """COLMAP's text model by file: one PINHOLE camera for each lens and size, no keypoints, no
+    points.
+    """
     lenses: dict[tuple[float, ...], int] = {}
-    images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then keypoints, of which there are none"]
+    images = [
+        "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then keypoints, of which there are none"
+    ]
     for index, camera in enumerate(cameras, start=1):
-        lens = lenses.setdefault((camera.width, camera.height, *map(float, intrinsics(camera))), len(lenses) + 1)
+        lens = lenses.setdefault(
+            (camera.width, camera.height, *map(float, intrinsics(camera))), len(lenses) + 1
+        )
         pose = [*quaternion(camera.cam_from_world[:3, :3]), *camera.cam_from_world[:3, 3]]
         images += [f"{index} {' '.join(repr(float(v)) for v in pose)} {lens} {camera.name}.png", ""]
     rows = [f"{key} PINHOLE {' '.join(map(repr, lens))}" for lens, key in lenses.items()]
     return {
-        "sparse/0/cameras.txt": "\n".join(["# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY", *rows, ""]),
+        "sparse/0/cameras.txt": "\n".join(
+            ["# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY", *rows, ""]
+        ),
         "sparse/0/images.txt": "\n".join([*images, ""]),
         "sparse/0/points3D.txt": "# no points\n",
     }
@@ -74,29 +84,37 @@ def transforms(cameras: Sequence[Camera]) -> dict[str, Any]:
 
 
 def gs_cameras(cameras: Sequence[Camera]) -> list[dict[str, Any]]:
-    """3DGS' list: position and axes of the camera in the world, OpenCV's. Choices: cx, cy, which the format takes to
-    be the middle, are added; readers that know no such key pass over it.
+    """3DGS' list: position and axes of the camera in the world, OpenCV's. Choices: cx, cy, which
+    the format takes to be the middle, are added; readers that know no such key pass over it.
     """
     rows = []
     for index, camera in enumerate(cameras):
         fx, fy, cx, cy = map(float, intrinsics(camera))
         row = {"id": index, "img_name": camera.name, "width": camera.width, "height": camera.height}
-        row |= {"position": camera.position.tolist(), "rotation": camera.cam_from_world[:3, :3].T.tolist()}
+        row |= {
+            "position": camera.position.tolist(),
+            "rotation": camera.cam_from_world[:3, :3].T.tolist(),
+        }
         rows.append(row | {"fy": fy, "fx": fx, "cx": cx, "cy": cy})
     return rows
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """The pinhole cameras of a transforms.json or a cameras.json, in its order; a lens's distortion is left away.
+    """The pinhole cameras of a transforms.json or a cameras.json, in its order; a lens's distortion
+    is left away.
 
     Raises: InputError naming the file and what of it cannot be used.
     """
     document = parse_json(path)
     if isinstance(document, dict) and isinstance(document.get("frames"), list):
-        return _read(path, document["frames"], lambda entry: _transforms_camera(path, document | entry))
+        return _read(
+            path, document["frames"], lambda entry: _transforms_camera(path, document | entry)
+        )
     if isinstance(document, list):
         return _read(path, document, lambda entry: _gs_camera(path, entry))
-    raise InputError(f"{path} is neither a transforms.json with frames nor a 3DGS cameras.json; {AGAIN}")
+    raise InputError(
+        f"{path} is neither a transforms.json with frames nor a 3DGS cameras.json; {AGAIN}"
+    )
 
 
 def _read(
@@ -118,14 +136,25 @@ def _read(
 
 
 def _transforms_camera(path: Path, entry: dict[str, Any]) -> tuple[str, np.ndarray, Any]:
-    """Name, camera-to-world [4, 4] in OpenCV's axes, and lens of a frame; its image need not be there."""
+    """Name, camera-to-world [4, 4] in OpenCV's axes, and lens of a frame; its image need not be
+    there.
+    """
     with _usable(path):
         width, height = number(entry["w"]), number(entry["h"])
         angled = "fl_x" not in entry
-        fx = 0.5 * width / math.tan(0.5 * number(entry["camera_angle_x"])) if angled else number(entry["fl_x"])
+        fx = (
+            0.5 * width / math.tan(0.5 * number(entry["camera_angle_x"]))
+            if angled
+            else number(entry["fl_x"])
+        )
         centre = number(entry.get("cx", width / 2)), number(entry.get("cy", height / 2))
         params = fx, number(entry.get("fl_y", fx)), *centre
-        matrix = np.vstack([np.array(entry["transform_matrix"], dtype=float), [0, 0, 0, 1]])[:4].reshape(4, 4) * OPENGL
+        matrix = (
+            np.vstack([np.array(entry["transform_matrix"], dtype=float), [0, 0, 0, 1]])[:4].reshape(
+                4, 4
+            )
+            * OPENGL
+        )
         name = stem(str(entry["file_path"]).removeprefix("./").removeprefix("images/"))
     return name, matrix, camera_of(path, "PINHOLE", params, width, height)
 

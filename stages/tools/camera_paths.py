@@ -1,4 +1,6 @@
-"""Cameras to render a scene from: its capture's, an orbit among them, or those of a file; in any size."""
+"""Cameras to render a scene from: its capture's, an orbit among them, or those of a file; in any
+size.
+"""
 
 from __future__ import annotations
 
@@ -19,18 +21,27 @@ from chebsplat.stages.tools.up import LEAST_SURE, Up, up_of
 ROUND = 120  # frames of an orbit
 
 
-def path_of(scene: OpenedScene, path: str, n_frames: int | None, up: Up | None = None) -> list[Camera]:
+def path_of(
+    scene: OpenedScene, path: str, n_frames: int | None, up: Up | None = None
+) -> list[Camera]:
     """`capture`: the capture's cameras; `orbit`: an orbit among them; otherwise a .json file's.
 
-    Args:   n_frames: of the orbit (None: 120), or of a path through the cameras (None: no path); up: of the orbit.
-    Raises: ConfigError if it is none of these, or up is given of another path than an orbit; InputError if the file's
-      cameras cannot be used.
+    Args:   n_frames: of the orbit (None: 120), or of a path through the cameras (None: no path);
+      up: of the orbit.
+    Raises: ConfigError if it is none of these, or up is given of another path than an orbit;
+      InputError if the file's cameras cannot be used.
     """
     if path == "orbit":
         poses = np.stack([camera.cam_from_world for camera in scene.cameras])
-        return orbit(scene.cameras, n_frames or ROUND, None if up is None else up_of(up, scene.parameters, poses))
+        return orbit(
+            scene.cameras,
+            n_frames or ROUND,
+            None if up is None else up_of(up, scene.parameters, poses),
+        )
     if up is not None:
-        raise ConfigError(f"--up is of an orbit, and the cameras of {path} have their own; add --path orbit")
+        raise ConfigError(
+            f"--up is of an orbit, and the cameras of {path} have their own; add --path orbit"
+        )
     if path == "capture":
         cameras = scene.cameras
     elif path.endswith(".json"):
@@ -41,12 +52,14 @@ def path_of(scene: OpenedScene, path: str, n_frames: int | None, up: Up | None =
 
 
 def orbit(cameras: list[Camera], n_frames: int, up: np.ndarray | None = None) -> list[Camera]:
-    """A round about what the cameras look at, on the ellipse that they themselves lie about, upright.
+    """A round about what the cameras look at, on the ellipse that they themselves lie about,
+    upright.
 
     Args: up: unit [3]; None: as the cameras were held.
-    Choices: the ellipse has the centre and the spread of the cameras in the plane across their common up; all frames
-      look at the point that is nearest to the cameras' axes, in least squares; where axes are parallel, at the mean of
-      what lies before the cameras at the distance of their spread. The lens is the first camera's.
+    Choices: the ellipse has the centre and the spread of the cameras in the plane across their
+      common up; all frames look at the point that is nearest to the cameras' axes, in least
+      squares; where axes are parallel, at the mean of what lies before the cameras at the distance
+      of their spread. The lens is the first camera's.
     """
     poses = np.stack([camera.cam_from_world for camera in cameras])
     eyes, ahead = centers(poses), poses[:, 2, :3]
@@ -80,7 +93,9 @@ def between(keys: list[Camera], n_frames: int) -> list[Camera]:
     if len(keys) < 2 or n_frames < 2:
         raise ConfigError("a path through cameras needs two of them, and --frames 2 at least")
     if len({(key.width, key.height) for key in keys}) > 1:
-        raise ConfigError("a path needs cameras of one size; without --frames each is rendered alone")
+        raise ConfigError(
+            "a path needs cameras of one size; without --frames each is rendered alone"
+        )
     poses, times = np.stack([camera.cam_from_world for camera in keys]), np.arange(len(keys))
     at = np.linspace(0, len(keys) - 1, n_frames)
     turns = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(at).as_matrix()
@@ -95,7 +110,9 @@ def between(keys: list[Camera], n_frames: int) -> list[Camera]:
 
 
 def focus(eyes: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """The point [3] nearest to lines from `eyes` [V, 3] along `ahead` [V, 3] (unit), in least squares."""
+    """The point [3] nearest to lines from `eyes` [V, 3] along `ahead` [V, 3] (unit), in least
+    squares.
+    """
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
     total = across.sum(0)
     if np.linalg.eigvalsh(total)[0] < 1e-3 * len(eyes):
@@ -105,7 +122,9 @@ def focus(eyes: np.ndarray, ahead: np.ndarray) -> np.ndarray:
 
 
 def looking(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """cam_from_world [4, 4], OpenCV's axes, of a camera at `eye` that looks at `target`, its top towards `up`."""
+    """cam_from_world [4, 4], OpenCV's axes, of a camera at `eye` that looks at `target`, its top
+    towards `up`.
+    """
     forward = target - eye
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, up)
@@ -119,7 +138,9 @@ def looking(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def fitted(camera: Camera, size: tuple[int, int] | None) -> Camera:
-    """The camera in `size` (width, height), all of its view within; what another shape adds is shown at the sides."""
+    """The camera in `size` (width, height), all of its view within; what another shape adds is
+    shown at the sides.
+    """
     if size is None:
         return camera
     width, height = size
@@ -138,5 +159,7 @@ def size_of(text: str | None) -> tuple[int, int] | None:
         raise ConfigError(f"--size {text}: WIDTHxHEIGHT in pixels is needed, such as 1280x960")
     size = int(width), int(height)
     if min(size) < 1 or max(size) > MAX_SIDE or size[0] * size[1] > MAX_PIXELS:
-        raise ConfigError(f"--size {text}: 1 to {MAX_SIDE} pixels a side, {MAX_PIXELS // 10**6} million at most")
+        raise ConfigError(
+            f"--size {text}: 1 to {MAX_SIDE} pixels a side, {MAX_PIXELS // 10**6} million at most"
+        )
     return size

@@ -12,7 +12,8 @@ from chebsplat.splats.parts import substantial
 from chebsplat.stages.tools.query import Query
 from chebsplat.stages.tools.scene import OpenedScene, passing
 
-CONVERT = "npx @playcanvas/splat-transform@2.7.1 scene.ply scene.compressed.ply"  # or scene.spz --spz-version 3
+# or scene.spz --spz-version 3
+CONVERT = "npx @playcanvas/splat-transform@2.7.1 scene.ply scene.compressed.ply"
 
 
 def extract(
@@ -34,7 +35,9 @@ def extract(
     Raises:  ConfigError on a filter that the scene cannot answer, DataFailure if nothing is left.
     """
     if out.suffix != ".ply" or out.name.endswith(".compressed.ply"):
-        raise ConfigError(f"{out}: only a plain .ply is written; convert that, for instance: {CONVERT}")
+        raise ConfigError(
+            f"{out}: only a plain .ply is written; convert that, for instance: {CONVERT}"
+        )
     filters = passing(scene.exported, scene.source, labels, min_opacity, box)
     if query is not None:
         filters["query"] = asked_for(scene.exported, query)
@@ -46,11 +49,15 @@ def extract(
 
 
 def asked_for(scene: Scene, query: Query) -> np.ndarray:
-    """Which Gaussians the query selects, bool [N], crumbs apart. Raises DataFailure where it is probably not here."""
+    """Which Gaussians the query selects, bool [N], crumbs apart. Raises DataFailure where it is
+    probably not here.
+    """
     answer = query.answer(scene.parameters["features"])
     if answer.present is False or not answer.selected.any():
         raise DataFailure(f"{answer}; ask for something else, or name a label with --keep-label")
-    return substantial(scene.parameters["means"], np.exp(scene.parameters["log_scales"]), answer.selected)
+    return substantial(
+        scene.parameters["means"], np.exp(scene.parameters["log_scales"]), answer.selected
+    )
 
 
 def corners(text: str | None) -> tuple[float, ...] | None:

@@ -1,4 +1,5 @@
-"""render: a finished scene as frames: colour, labels, depth, relevancy. A frame that is there and whole is kept.
+"""render: a finished scene as frames: colour, labels, depth, relevancy. A frame that is there and
+whole is kept.
 
 A video of them is H.264 in MP4, through PyAV.
 """
@@ -39,8 +40,8 @@ CRF = "18"  # x264's constant rate factor: hardly told from the frames by eye
 
 @dataclass(frozen=True)
 class Shot:
-    """What is rendered of every camera: kinds of KINDS; identity: of the scene, so that frames of another are told
-    apart; query: where relevancy is among the kinds.
+    """What is rendered of every camera: kinds of KINDS; identity: of the scene, so that frames of
+    another are told apart; query: where relevancy is among the kinds.
     """
 
     kinds: tuple[str, ...]
@@ -49,7 +50,8 @@ class Shot:
 
 
 def kinds_of(text: str, scene: OpenedScene, asked: bool) -> tuple[str, ...]:
-    """The kinds in "color,depth". Raises ConfigError on one that is none, or that the scene or the query cannot give.
+    """The kinds in "color,depth". Raises ConfigError on one that is none, or that the scene or the
+    query cannot give.
 
     Args: asked: whether there is a query.
     """
@@ -61,21 +63,25 @@ def kinds_of(text: str, scene: OpenedScene, asked: bool) -> tuple[str, ...]:
     if asked and "relevancy" not in kinds:
         raise ConfigError("--query is of relevancy; add relevancy to --what")
     if scene.labels is None and (missing := [kind for kind in kinds if kind in SEMANTIC]):
-        raise ConfigError(f"{scene.source} has no semantics, so no {missing[0]}; render color,depth")
+        raise ConfigError(
+            f"{scene.source} has no semantics, so no {missing[0]}; render color,depth"
+        )
     return kinds
 
 
 def render_frames(
     scene: OpenedScene, cameras: Sequence[Camera], shot: Shot, out: Path, progress: Progress
 ) -> dict[str, list[Path]]:
-    """Render every camera's frames into OUT/<kind>/<view>.png (depth: .npy); those that are there are kept.
+    """Render every camera's frames into OUT/<kind>/<view>.png (depth: .npy); those that are there
+    are kept.
 
     Returns: the files of each kind, in the cameras' order.
     Raises:  ConfigError where `out` holds something else than frames of this request.
-    Choices: colour is 8-bit RGB, as `evaluate` measures it. Labels are a palette PNG whose values are row of
-      label_names + 1, 0 where a pixel is less than half covered; 16-bit grey without palette beyond 255 labels.
-      Depth is float32 .npy, scene units along the camera's axis, nan where nothing is: units are the source's own, and
-      16 bits of thousandths would cut or coarsen what is no metre. Relevancy is the render under its heat.
+    Choices: colour is 8-bit RGB, as `evaluate` measures it. Labels are a palette PNG whose values
+      are row of label_names + 1, 0 where a pixel is less than half covered; 16-bit grey without
+      palette beyond 255 labels. Depth is float32 .npy, scene units along the camera's axis, nan
+      where nothing is: units are the source's own, and 16 bits of thousandths would cut or coarsen
+        what is no metre. Relevancy is the render under its heat.
     """
     names = file_names([f"{camera.name}.png" for camera in cameras])
     claim(out, cameras, shot, scene)
@@ -95,14 +101,20 @@ def render_frames(
 
 
 def file_names(views: list[str]) -> list[str]:
-    """A file's name for each view: its path with every separator replaced, and a number where two would be alike."""
+    """A file's name for each view: its path with every separator replaced, and a number where two
+    would be alike.
+    """
     names: list[str] = []
     for view in views:
         name = re.sub(r"[^\w.-]+", "-", view.removesuffix(Path(view).suffix)).strip(".-") or "view"
         name = name.encode()[:200].decode(errors="ignore")
         taken = {held.lower() for held in names}  # some file systems fold case
         names.append(
-            next(new for k in itertools.count(1) if (new := name if k == 1 else f"{name}-{k}").lower() not in taken)
+            next(
+                new
+                for k in itertools.count(1)
+                if (new := name if k == 1 else f"{name}-{k}").lower() not in taken
+            )
         )
     return names
 
@@ -113,13 +125,18 @@ def ending(kind: str) -> str:
 
 
 def claim(out: Path, cameras: Sequence[Camera], shot: Shot, scene: OpenedScene) -> None:
-    """Write down what the frames of `out` are of, or check that those that are there are of the same."""
+    """Write down what the frames of `out` are of, or check that those that are there are of the
+    same.
+    """
     request = {"scene": shot.identity, "labels": scene.label_names, "cameras": gs_cameras(cameras)}
     request |= {"query": None if shot.query is None else [shot.query.text, *shot.query.phrases]}
     path = out / REQUEST
     if path.exists():
         if parse_json(path) != json.loads(json.dumps(request)):
-            raise ConfigError(f"{out} holds frames of another scene, path, size or query; remove it, or choose --out")
+            raise ConfigError(
+                f"{out} holds frames of another scene, path, size or query; remove "
+                "it, or choose --out"
+            )
     elif out.exists() and any(out.iterdir()):
         raise ConfigError(f"{out} holds something else than frames; choose another --out")
     else:
@@ -135,25 +152,34 @@ def whole(path: Path, camera: Camera) -> bool:
         if path.suffix == ".npy":
             return bool(np.load(path, allow_pickle=False).shape == size[::-1])
         with opened(path) as image:
-            return bool(image.size == size) and path.read_bytes().endswith(PNG_END)  # its reader needs no end
+            # its reader needs no end
+            return bool(image.size == size) and path.read_bytes().endswith(PNG_END)
     except (InputError, ValueError, OSError, EOFError) as error:
         log.warning("%s is rendered again: %s", path, error)
         return False
 
 
-def pictures(scene: OpenedScene, camera: Camera, shot: Shot, kinds: Sequence[str]) -> dict[str, np.ndarray]:
-    """The arrays of these kinds: color and relevancy u8 [H, W, 3], labels i32 [H, W], depth f32 [H, W]."""
+def pictures(
+    scene: OpenedScene, camera: Camera, shot: Shot, kinds: Sequence[str]
+) -> dict[str, np.ndarray]:
+    """The arrays of these kinds: color and relevancy u8 [H, W, 3], labels i32 [H, W], depth f32 [H,
+    W].
+    """
     from chebsplat.stages.pages.pictures import heat
 
     view, renderer = scene.inside(camera).view(), scene.renderer
     found: dict[str, np.ndarray] = {}
     features = None
     if set(kinds) != {"depth"}:
-        found["color"], features = renderer.render(view, with_features=bool(set(kinds) & set(SEMANTIC)))
+        found["color"], features = renderer.render(
+            view, with_features=bool(set(kinds) & set(SEMANTIC))
+        )
     if "depth" in kinds or "labels" in kinds:
         found["depth"], alpha = scene.depth(view)
         if "labels" in kinds and features is not None and scene.label_embeddings is not None:
-            found["labels"] = np.where(alpha < COVERED, -1, decode_labels(features, scene.label_embeddings))
+            found["labels"] = np.where(
+                alpha < COVERED, -1, decode_labels(features, scene.label_embeddings)
+            )
     if "relevancy" in kinds and features is not None and shot.query is not None:
         found["relevancy"] = heat(found["color"], shot.query.scores(features))
     return {kind: found[kind] for kind in kinds}
@@ -183,7 +209,9 @@ def shown(kind: str, path: Path, far: float) -> np.ndarray:
 
 
 def depth_colors(depth: np.ndarray, far: float) -> np.ndarray:
-    """Depth [H, W], nan where nothing is, as u8 [H, W, 3]: turbo, red is near; far: scene units, the darkest."""
+    """Depth [H, W], nan where nothing is, as u8 [H, W, 3]: turbo, red is near; far: scene units,
+    the darkest.
+    """
     from matplotlib import colormaps
 
     colors = colormaps["turbo"](1 - (np.nan_to_num(depth, nan=far) / far).clip(0, 1))[..., :3]
@@ -195,14 +223,22 @@ def library() -> Any:
     try:
         import av
     except ImportError:
-        raise ConfigError(f"videos need the extra `video`: {INSTALL}; or render into a folder") from None
+        raise ConfigError(
+            f"videos need the extra `video`: {INSTALL}; or render into a folder"
+        ) from None
     return av
 
 
 def render_video(
-    scene: OpenedScene, cameras: Sequence[Camera], shot: Shot, out: Path, rate: int, progress: Progress
+    scene: OpenedScene,
+    cameras: Sequence[Camera],
+    shot: Shot,
+    out: Path,
+    rate: int,
+    progress: Progress,
 ) -> None:
-    """Render one kind of frames into a video; frames lie beside it, and stay there until it is written.
+    """Render one kind of frames into a video; frames lie beside it, and stay there until it is
+    written.
 
     Raises: ConfigError where `out` exists, on two kinds, and on sizes that no video has.
     """
@@ -210,7 +246,9 @@ def render_video(
     if out.exists():
         raise ConfigError(f"{out} exists; remove it, or choose another --out")
     if len(shot.kinds) != 1:
-        raise ConfigError(f"a video shows one of {','.join(shot.kinds)}; choose one, or a folder for --out")
+        raise ConfigError(
+            f"a video shows one of {','.join(shot.kinds)}; choose one, or a folder for --out"
+        )
     sizes = {(camera.width, camera.height) for camera in cameras}
     if len(sizes) > 1:
         raise ConfigError("the cameras have several sizes, a video has one; choose a --size")
@@ -227,11 +265,15 @@ def render_video(
 def check_size(size: tuple[int, int]) -> None:
     """Raise ConfigError where a video cannot have this size (width, height)."""
     if size[0] % 2 or size[1] % 2:
-        raise ConfigError(f"a video's sides are even, not {size[0]}x{size[1]}; choose another --size")
+        raise ConfigError(
+            f"a video's sides are even, not {size[0]}x{size[1]}; choose another --size"
+        )
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], size: tuple[int, int], rate: int) -> None:
-    """Write pictures u8 [H, W, 3] of `size` (width, height), `rate` a second, whole or not at all."""
+    """Write pictures u8 [H, W, 3] of `size` (width, height), `rate` a second, whole or not at
+    all.
+    """
     av = library()
     check_size(size)
     with atomic_path(path) as temporary, av.open(str(temporary), "w") as container:

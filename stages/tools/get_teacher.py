@@ -1,4 +1,5 @@
-"""A closed-set segmenter from the Hugging Face hub, or its cache, as the three files of a teacher; and
+"""A closed-set segmenter from the Hugging Face hub, or its cache, as the three files of a teacher;
+and
 a teacher tried on one image before a scene is: what it is, what it costs, what it sees.
 """
 
@@ -42,7 +43,9 @@ SHOWN = 8  # labels
 TRIED = 8  # photos
 
 
-def get_teacher(name: str, out: Path | None = None, graph: str = GRAPH) -> tuple[Path, list[tuple[str, str]]]:
+def get_teacher(
+    name: str, out: Path | None = None, graph: str = GRAPH
+) -> tuple[Path, list[tuple[str, str]]]:
     """Fetch a teacher into a folder, as NAME.onnx, NAME.toml and NAME.txt; the .onnx, and what
     `check-teacher` finds.
 
@@ -57,7 +60,9 @@ def get_teacher(name: str, out: Path | None = None, graph: str = GRAPH) -> tuple
     origin = f"hf:{repository}@{revision}/{graph}"
     if folder.exists():
         if not model.is_file() or read_teacher(model).origin != origin:
-            raise ConfigError(f"{folder} exists and is not {origin}; remove it, or choose another --out")
+            raise ConfigError(
+                f"{folder} exists and is not {origin}; remove it, or choose another --out"
+            )
         return model, check(model)
     held = {file: fetched(repository, file, revision) for file in (CLASSES, PREPARATION, graph)}
     weights = {
@@ -93,7 +98,9 @@ def parsed(name: str) -> tuple[str, str, str]:
         return TEACHERS[name], "main", name
     if not (found := REPOSITORY.fullmatch(name)):
         known = ", ".join(TEACHERS)
-        raise ConfigError(f"{name[:100]!a} is no teacher; there are {known}, and hf:OWNER/NAME[@REVISION]")
+        raise ConfigError(
+            f"{name[:100]!a} is no teacher; there are {known}, and hf:OWNER/NAME[@REVISION]"
+        )
     return found[1], found[2] or "main", found[1].rpartition("/")[2].lower()
 
 
@@ -104,7 +111,8 @@ def fetched(repository: str, file: str, revision: str) -> Path:
         from huggingface_hub import constants, errors, hf_hub_download
     except ImportError:
         raise ConfigError(
-            "get-teacher needs the package huggingface_hub: .venv/bin/pip install -e '.[hub]' installs it"
+            "get-teacher needs the package huggingface_hub: .venv/bin/pip install -e '.[hub]' "
+            "installs it"
         ) from None
 
     where = f"{repository}: {file}"
@@ -143,9 +151,15 @@ def refusal(fault: Any, repository: str, file: str, revision: str) -> str:
     """One line about what the hub answers instead of a file."""
     kind = type(fault).__name__
     if kind == "RemoteEntryNotFoundError":
-        return f"hf:{repository} has no {file} at {revision}; name another ONNX file with --file, or another repository"
+        return (
+            f"hf:{repository} has no {file} at {revision}; name another ONNX file with --file, "
+            "or another repository"
+        )
     if kind in ("RepositoryNotFoundError", "RevisionNotFoundError", "GatedRepoError"):
-        return f"hf:{repository}@{revision} is not there, private or gated; correct the name, or log in (hf auth login)"
+        return (
+            f"hf:{repository}@{revision} is not there, private or gated; correct the name, or "
+            "log in (hf auth login)"
+        )
     return f"hf:{repository}: the hub answers {fault.response.status_code} for {file}; {AGAIN}"
 
 
@@ -157,7 +171,8 @@ def verified(path: Path) -> Path:
     """
     if not path.is_symlink():
         raise InputError(
-            f"{path} is no link, as the hub's cache has them to files called by their checksums; set "
+            f"{path} is no link, as the hub's cache has them to files called by their checksums; "
+            "set "
             f"HF_HOME to a folder of another disk, and {AGAIN}"
         )
     checksum, blob = path.readlink().name, path.resolve()
@@ -180,10 +195,19 @@ def document(path: Path) -> dict[str, Any]:
 
 
 def class_names(path: Path, repository: str) -> list[str]:
-    """Names of the classes in the order of the channels, unique, as a file of labels can hold them."""
+    """Names of the classes in the order of the channels, unique, as a file of labels can hold
+    them.
+    """
     named = document(path).get("id2label")
-    if not isinstance(named, dict) or set(named) != {str(k) for k in range(len(named))} or not named:
-        raise InputError(f"hf:{repository}: config.json names no classes (id2label); a closed-set segmenter is needed")
+    if (
+        not isinstance(named, dict)
+        or set(named) != {str(k) for k in range(len(named))}
+        or not named
+    ):
+        raise InputError(
+            f"hf:{repository}: config.json names no classes (id2label); a closed-set "
+            "segmenter is needed"
+        )
     names: list[str] = []
     for k in range(len(named)):
         name = re.sub(r"[:#\s]+", " ", str(named[str(k)])).strip() or f"class {k}"
@@ -206,7 +230,8 @@ def preparation(path: Path, repository: str) -> dict[str, Any]:
 def feeding(values: dict[str, Any]) -> dict[str, Any]:
     """These keys, of an image processor's values. Raises: ValueError.
 
-    Choices: what is cropped from a photo's middle is a window's size; a photo keeps its aspect ratio.
+    Choices: what is cropped from a photo's middle is a window's size; a photo keeps its aspect
+      ratio.
     """
 
     def does(step: str, usual: bool) -> bool:
@@ -214,7 +239,9 @@ def feeding(values: dict[str, Any]) -> dict[str, Any]:
 
     kind = values.get("image_processor_type", values.get("feature_extractor_type", ""))
     flipped = does("flip_channel_order", "MobileViT" in str(kind))
-    others = [key for key, value in values.items() if (key.startswith("do_") or "offset" in key) and value]
+    others = [
+        key for key, value in values.items() if (key.startswith("do_") or "offset" in key) and value
+    ]
     if unknown := sorted({*others} - {f"do_{step}" for step in STEPS}):
         raise ValueError(f"asks for {', '.join(unknown)}, which no key of a teacher stands for")
     mean, std = [0.0] * 3, [1.0] * 3
@@ -226,10 +253,14 @@ def feeding(values: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(factor, int | float) or not 0 < factor < 1e3:
         raise ValueError(f"has a rescale_factor of {factor!r:.40}")
     if flipped and len({*mean}) + len({*std}) > 2:
-        raise ValueError("turns the order of channels that are normalised apart (do_flip_channel_order)")
+        raise ValueError(
+            "turns the order of channels that are normalised apart (do_flip_channel_order)"
+        )
     whole = 1 if np.isclose(255 * factor, 1, 1e-9) else 255 * factor  # what 255 becomes
     if max(*mean, *std) > 1 and whole <= 1:
-        raise ValueError("has image_mean or image_std of colours in 0 to 255, and rescales to 0 to 1 before")
+        raise ValueError(
+            "has image_mean or image_std of colours in 0 to 255, and rescales to 0 to 1 before"
+        )
     number = values.get("resample", 2)
     if number not in range(len(RESAMPLING)):
         raise ValueError(f"has a resample of {number!r:.40}")
@@ -246,7 +277,9 @@ def three(value: Any) -> list[float]:
 
 
 def window_of(values: dict[str, Any], resized: bool, cropped: bool) -> dict[str, Any]:
-    """`size` and `base` of a TOML: the sides of a window, and a photo's long side. Raises: ValueError."""
+    """`size` and `base` of a TOML: the sides of a window, and a photo's long side. Raises:
+    ValueError.
+    """
 
     def sides(key: str) -> tuple[list[int], int | None]:
         of = values.get(key)
@@ -254,7 +287,9 @@ def window_of(values: dict[str, Any], resized: bool, cropped: bool) -> dict[str,
         of = of if isinstance(of, dict) else {"shortest_edge": of}
         longest = of.get("longest_edge")
         short = of.get("shortest_edge", longest)
-        found = [side for side in (of.get("height", short), of.get("width", short)) if type(side) is int]
+        found = [
+            side for side in (of.get("height", short), of.get("width", short)) if type(side) is int
+        ]
         if len(found) < 2 or not isinstance(longest, int | None):
             raise ValueError(f"has no {key} of whole numbers")
         return found, longest
@@ -267,7 +302,9 @@ def window_of(values: dict[str, Any], resized: bool, cropped: bool) -> dict[str,
     return {"size": size, "base": base if longest is None else min(base, longest)} | crop
 
 
-def check(model: Path, photos: Sequence[Path] = (), labels: str | None = None) -> list[tuple[str, str]]:
+def check(
+    model: Path, photos: Sequence[Path] = (), labels: str | None = None
+) -> list[tuple[str, str]]:
     """(what, finding) of a teacher. Raises what the teacher stage would.
 
     Args: photos: or folders of them, which tell the usual mistakes (`teacher_models/trials.py`);
@@ -279,9 +316,13 @@ def check(model: Path, photos: Sequence[Path] = (), labels: str | None = None) -
     settings = TeacherSection()
     teacher = read_teacher(model)
     network = TeacherInference(teacher, n_threads())
-    found = [images_below(path, "give another --photo") if path.is_dir() else [path] for path in photos]
+    found = [
+        images_below(path, "give another --photo") if path.is_dir() else [path] for path in photos
+    ]
     files = [file for of in found for file in of]
-    looked_at = [shown(file) for file in files[:: -(-len(files) // TRIED)]] if files else [shown(None)]
+    looked_at = (
+        [shown(file) for file in files[:: -(-len(files) // TRIED)]] if files else [shown(None)]
+    )
     (name, image), images = looked_at[0], [image for _, image in looked_at]
     grid, n_channels = network.grid(image, settings.downscale)
     if teacher.output == "logits":
@@ -291,7 +332,9 @@ def check(model: Path, photos: Sequence[Path] = (), labels: str | None = None) -
     else:
         space = open_vocabulary(teacher, label_set(teacher, labels, None), n_channels, None)
     began = time.perf_counter()
-    _, pseudo_labels, confidence = space.split(network.features(image, grid, settings.scales, settings.flips, name))
+    _, pseudo_labels, confidence = space.split(
+        network.features(image, grid, settings.scales, settings.flips, name)
+    )
     seconds = time.perf_counter() - began
     size = network.scaled_size(image, 1.0)
     window = network.window(size)
@@ -303,18 +346,30 @@ def check(model: Path, photos: Sequence[Path] = (), labels: str | None = None) -
     if teacher.output == "logits":
         taken = "" if network.scores == LOGITS else ", told by its values, and taken as such"
         if sureness(float(confidence.mean()), len(space.names)) < UNSURE:
-            taken += "; unsure of everything, as of a softmax taken twice or of logits that were scaled down"
+            taken += (
+                "; unsure of everything, as of a softmax taken twice or of logits that were "
+                "scaled down"
+            )
         findings.append(("scores", network.scores + taken))
     if files:
-        classes = read_label_table(teacher.labels)[0] if teacher.output == "logits" and teacher.labels else space.names
+        classes = (
+            read_label_table(teacher.labels)[0]
+            if teacher.output == "logits" and teacher.labels
+            else space.names
+        )
         findings += tried(network, images, classes, space.embeddings)
     return [
         ("name", f"{teacher.name} ({model}, {model.stat().st_size / 2**20:.1f} MB)"),
-        ("output", f"{teacher.output}{by}, {n_channels} channels" + (", reduced to fewer in a scene" if wide else "")),
+        (
+            "output",
+            f"{teacher.output}{by}, {n_channels} channels"
+            + (", reduced to fewer in a scene" if wide else ""),
+        ),
         ("image", f"{name}, {image.shape[1]} x {image.shape[0]}, seen at {size[1]} x {size[0]}"),
         (
             "windows",
-            f"{n_windows(size, window)} of {window[1]} x {window[0]}{'' if network.size else ' (any size)'}",
+            f"{n_windows(size, window)} of {window[1]} x "
+            f"{window[0]}{'' if network.size else ' (any size)'}",
         ),
         ("map", f"{grid[1]} x {grid[0]}: one feature every {image.shape[0] / grid[0]:.3g} pixels"),
         ("labels", f"{len(space.names)}, from {labels or teacher.labels}"),

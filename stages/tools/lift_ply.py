@@ -1,5 +1,5 @@
-"""A splat that someone else trained, as a scene: as it is, with what the 2D teacher says by a capture's photos, or with
-the names of its Gaussians by shape and knowledge alone.
+"""A splat that someone else trained, as a scene: as it is, with what the 2D teacher says by a
+capture's photos, or with the names of its Gaussians by shape and knowledge alone.
 """
 
 from __future__ import annotations
@@ -47,18 +47,26 @@ log = logging.getLogger("chebsplat")
 
 
 def lift_ply(
-    ply: Path, capture: Path, points: Path | None, features: Path | None, model: Path | None, out: Path
+    ply: Path,
+    capture: Path,
+    points: Path | None,
+    features: Path | None,
+    model: Path | None,
+    out: Path,
 ) -> dict[str, Any]:
     """Lift features to the Gaussians of a PLY, and export them.
 
     Args:
       ply:      a 3DGS PLY, which is brought into the frame of the cameras.
-      capture:  a `capture` artifact; points: a `points` artifact with its cameras, where the capture has no poses.
+      capture:  a `capture` artifact; points: a `points` artifact with its cameras, where the
+        capture has no poses.
       features: a `features` artifact of this capture; None: the teacher is run.
       model:    .onnx of the teacher to run; None: the embedded one.
-      out:      becomes a folder of artifacts by name, as a scene's: gaussians, lift, export, and what the teacher made.
+      out:      becomes a folder of artifacts by name, as a scene's: gaussians, lift, export, and
+        what the teacher made.
     Returns: counts.
-    Raises:  InputError on what cannot be read or fits in no frame, DataFailure if no view sees a Gaussian.
+    Raises:  InputError on what cannot be read or fits in no frame, DataFailure if no view sees a
+      Gaussian.
     """
     held = Capture.read(capture)
     cameras, world = cameras_of(capture, points), World.read(held.source)
@@ -83,7 +91,8 @@ def lift_ply(
 
 
 def import_ply(ply: Path, out: Path, up: Up | None = None) -> dict[str, Any]:
-    """A PLY as a scene without semantics, of `gaussians` and `export` below `out`; one camera sees its middle half.
+    """A PLY as a scene without semantics, of `gaussians` and `export` below `out`; one camera sees
+    its middle half.
 
     Args: up: of that camera, and so of pages and orbits; None: -y.
     Returns: counts. Raises: InputError on what cannot be read.
@@ -94,33 +103,48 @@ def import_ply(ply: Path, out: Path, up: Up | None = None) -> dict[str, Any]:
     return {"gaussians": artifact.read_manifest(out / "export").facts["n_gaussians"]}
 
 
-def taken_over(ply: Path, parameters: dict[str, np.ndarray], cameras: Cameras, out: Path, world: World = HERE) -> None:
+def taken_over(
+    ply: Path, parameters: dict[str, np.ndarray], cameras: Cameras, out: Path, world: World = HERE
+) -> None:
     """Make the folder `out`, and in it `gaussians` of what a PLY holds; world: of the capture."""
     out.mkdir(parents=True)
     given = {"path": ply.name, "sha256": artifact.sha256_file(splat_file(ply))}
     manifest = Manifest(Gaussians.SCHEMA, artifact.digest(given), "train", facts={"source": given})
     with artifact.publish(out / "gaussians", manifest) as tmp:
-        Gaussians(parameters, cameras, notes=world.notes | {"left_out": {"training": "the splat was given"}}).write(tmp)
+        Gaussians(
+            parameters,
+            cameras,
+            notes=world.notes | {"left_out": {"training": "the splat was given"}},
+        ).write(tmp)
 
 
 def cameras_of(capture: Path, points: Path | None) -> Cameras:
-    """The cameras of a capture, or of the points that were reconstructed from it. Raises InputError without poses."""
+    """The cameras of a capture, or of the points that were reconstructed from it. Raises InputError
+    without poses.
+    """
     held = Capture.read(capture)
     if points is not None:
         found = Points.read(points)
         return Cameras(found.names, found.Ks, found.cam_from_world, *held.size)
     if held.cam_from_world is None:
-        raise InputError(f"{capture} has no poses; name the scene, whose sfm has them, or ingest a source with poses")
+        raise InputError(
+            f"{capture} has no poses; name the scene, whose sfm has them, or ingest "
+            "a source with poses"
+        )
     return Cameras(held.names, held.Ks, held.cam_from_world, *held.size)
 
 
 def taught(capture: Path, model: Path | None, out: Path) -> Path:
-    """Features of a capture by an ONNX teacher, in the channels that a run would give a scene; below `out`."""
+    """Features of a capture by an ONNX teacher, in the channels that a run would give a scene;
+    below `out`.
+    """
     from chebsplat.stages import channels, teacher
 
     used = str((model or EMBEDDED).absolute())
     config, inputs = out / "teacher.json", {"capture": capture}
-    config.write_text(json.dumps({"teacher": {"kind": "onnx", "model": used}, "channels": {"model": used}}))
+    config.write_text(
+        json.dumps({"teacher": {"kind": "onnx", "model": used}, "channels": {"model": used}})
+    )
     if read_teacher(Path(used)).output == "features":
         publish("channels", channels.run, out / "channels", {}, config)
         inputs["channels"] = out / "channels"
@@ -131,17 +155,20 @@ def taught(capture: Path, model: Path | None, out: Path) -> Path:
 def label_ply(
     ply: Path, knowledge: Path, words: list[str], asked_up: Up, unit: float | None, out: Path
 ) -> dict[str, Any]:
-    """Write the PLY again with a label a Gaussian, and beside it an .npz: names, labels [N], confidence f32 [N].
+    """Write the PLY again with a label a Gaussian, and beside it an .npz: names, labels [N],
+    confidence f32 [N].
 
     Args:
       ply:       a 3DGS PLY of a room; knowledge: a `knowledge` artifact; words: to choose among.
-      asked_up:  against gravity, in the PLY's frame; unit: its units in a metre; None: by the room's extent.
+      asked_up:  against gravity, in the PLY's frame; unit: its units in a metre; None: by the
+        room's extent.
     Returns: counts, and the share of each name.
-    Raises:  ConfigError if `out` exists or a word is not known; InputError on what cannot be read; DataFailure where
+    Raises:  ConfigError if `out` exists or a word is not known; InputError on what cannot be read;
+      DataFailure where
              the splat shows no surface.
-    Choices: shape is described on the surface that is rendered from within, and carried to the Gaussians beside it. The
-      confidence is that of the label among the words, times the length of the answer: how alike a teacher's views were
-      where shapes were like this one.
+    Choices: shape is described on the surface that is rendered from within, and carried to the
+      Gaussians beside it. The confidence is that of the label among the words, times the length of
+      the answer: how alike a teacher's views were where shapes were like this one.
     """
     beside = out.with_suffix(".npz")
     for path in (out, beside):
@@ -158,16 +185,22 @@ def label_ply(
         raise InputError(f"{ply} holds no Gaussians; choose another")
     up = up_of(asked_up, parameters)
     unit = room_unit(parameters["means"]) if unit is None else unit
-    poses, Ks = lookouts(parameters["means"].astype(np.float64), expit(parameters["logit_opacities"]), up)
+    poses, Ks = lookouts(
+        parameters["means"].astype(np.float64), expit(parameters["logit_opacities"]), up
+    )
     cloud = shown(parameters, poses, Ks, LOOKOUT_SIZE, unit)
     log.info("%d points of a surface, %.3g units a metre", len(cloud.means), unit)
-    answers = answered(held, point_inputs(*cloud, up=up, unit=unit, describe=DescribeSection(**held.describe)))
+    answers = answered(
+        held, point_inputs(*cloud, up=up, unit=unit, describe=DescribeSection(**held.describe))
+    )
     normals = surface_of(parameters)[0]
     carried, _ = carry(answers, cloud.means, cloud.normals, parameters["means"], normals, unit)
     labels, sure = decode(carried[:, carried.shape[1] // 2 :], units(held.embeddings[rows]))
     confidence = sure * np.linalg.norm(carried[:, carried.shape[1] // 2 :], axis=1).clip(0, 1)
     with atomic_path(beside) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, names=np.array(words), labels=labels, confidence=confidence.astype(np.float32))
+        np.savez(
+            stream, names=np.array(words), labels=labels, confidence=confidence.astype(np.float32)
+        )
     with atomic_path(out) as temporary:
         write_ply(temporary, parameters, degree, labels, words)
     shares = {word: float((labels == k).mean()) for k, word in enumerate(words)}

@@ -18,7 +18,8 @@ from chebsplat.synthetic.rays import open3d
 
 N_VOXELS = 250  # along the longest side of the room, where no voxel is asked for
 OPAQUE = 0.6  # least coverage of a pixel whose depth counts
-STEP = 0.05  # of its depth, by which a neighbouring pixel may lie deeper: beyond, a pixel is on an edge
+# of its depth, by which a neighbouring pixel may lie deeper: beyond, a pixel is on an edge
+STEP = 0.05
 LONGEST_HOLE = 60  # edges
 N_TRIED = 100  # points of a view, at most, whose distance from the mesh is measured
 LEAST_PART = 12.0  # voxels across a connected part that stays
@@ -27,16 +28,20 @@ LEAST_PART = 12.0  # voxels across a connected part that stays
 def mesh_of(
     scene: OpenedScene, voxel: float | None, n_triangles: int, raw: bool, progress: Progress
 ) -> tuple[Mesh, dict[str, Any]]:
-    """The mesh of a scene in its source's frame and units, and facts: voxel, how many triangles before and after, and
-    how far the surface that the views see is from it.
+    """The mesh of a scene in its source's frame and units, and facts: voxel, how many triangles
+    before and after, and how far the surface that the views see is from it.
 
-    Args: voxel: edge, scene units; None: the 250th part of the room; n_triangles: at most; raw: nothing is cleaned.
+    Args: voxel: edge, scene units; None: the 250th part of the room; n_triangles: at most; raw:
+      nothing is cleaned.
     Raises: ConfigError on a scene without cameras; DataFailure where its Gaussians show no surface.
-    Choices: depth is that of `render_depth`, from every view of the capture; a pixel on an edge of depth has none. A
-      vertex means what the Gaussians around it mean (`evaluation.metrics.features_at`).
+    Choices: depth is that of `render_depth`, from every view of the capture; a pixel on an edge of
+      depth has none. A vertex means what the Gaussians around it mean
+      (`evaluation.metrics.features_at`).
     """
     if not scene.cameras:
-        raise ConfigError(f"{scene.source} has no cameras to see its surface from; open a scene that was trained")
+        raise ConfigError(
+            f"{scene.source} has no cameras to see its surface from; open a scene that was trained"
+        )
     if not raw:
         meshlab()  # a missing extra is said before minutes are spent
     extent = room_extent(scene)
@@ -45,12 +50,16 @@ def mesh_of(
     seen: list[np.ndarray] = []
     made = fused(open3d(), noted(frames(scene, progress), seen), edge, 2 * extent)
     if not len(made.triangles):
-        raise DataFailure(f"{scene.source} shows no surface of voxels of {shown}; choose larger ones: --voxel")
+        raise DataFailure(
+            f"{scene.source} shows no surface of voxels of {shown}; choose larger ones: --voxel"
+        )
     facts = {"voxel": float(shown), "triangles fused": len(made.triangles)}
     if not raw:
         made = cleaned(made, n_triangles, LEAST_PART * edge, LONGEST_HOLE, edge)
     if not len(made.triangles):
-        raise DataFailure(f"nothing of the surface is larger than {LEAST_PART:g} voxels of {shown}; take --raw")
+        raise DataFailure(
+            f"nothing of the surface is larger than {LEAST_PART:g} voxels of {shown}; take --raw"
+        )
     off = away(made, np.concatenate(seen)) * scene.world.scale
     facts |= {"off the depth, median": float(f"{off:.2g}")}
     if scene.features is not None and scene.label_embeddings is not None:
@@ -70,7 +79,9 @@ def turned(mesh: Mesh, up: np.ndarray, suffix: str) -> Mesh:
 def away(mesh: Mesh, points: np.ndarray) -> float:
     """The median distance from points [M, 3] to a mesh, scene units."""
     core, caster = open3d().core, open3d().t.geometry.RaycastingScene()
-    caster.add_triangles(*map(core.Tensor, (mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32))))
+    caster.add_triangles(
+        *map(core.Tensor, (mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32)))
+    )
     return float(np.median(caster.compute_distance(core.Tensor(points.astype(np.float32))).numpy()))
 
 
@@ -78,7 +89,9 @@ def noted(frames: Iterable[Frame], points: list[np.ndarray]) -> Iterator[Frame]:
     """The frames; some of the points [M, 3] that each shows are added to `points`."""
     for frame in frames:
         pixels = np.argwhere(frame.depth > 0)
-        points.append(unproject(frame.depth, frame.K, frame.pose, pixels[:: len(pixels) // N_TRIED + 1]))
+        points.append(
+            unproject(frame.depth, frame.K, frame.pose, pixels[:: len(pixels) // N_TRIED + 1])
+        )
         yield frame
 
 
@@ -94,7 +107,9 @@ def frames(scene: OpenedScene, progress: Progress) -> Iterator[Frame]:
 
 
 def without_edges(depth: np.ndarray) -> np.ndarray:
-    """Depth [H, W], 0 or nan where unknown, as f32 with 0 there, and where a neighbour is deeper or nearer by STEP."""
+    """Depth [H, W], 0 or nan where unknown, as f32 with 0 there, and where a neighbour is deeper or
+    nearer by STEP.
+    """
     logarithm = np.log(np.where(depth > 0, depth, np.nan))
     on_edge = np.zeros(depth.shape, bool)
     for axis in (0, 1):
@@ -104,7 +119,9 @@ def without_edges(depth: np.ndarray) -> np.ndarray:
 
 
 def room_extent(scene: OpenedScene) -> float:
-    """The longest side of the box that holds 98 % of the opaque Gaussians along each axis, inside."""
+    """The longest side of the box that holds 98 % of the opaque Gaussians along each axis,
+    inside.
+    """
     means, logits = scene.parameters["means"], scene.parameters["logit_opacities"]
     solid = means[logits > 0] if (logits > 0).any() else means
     low, high = np.quantile(solid, (0.01, 0.99), axis=0)
@@ -112,7 +129,8 @@ def room_extent(scene: OpenedScene) -> float:
 
 
 def labels_at(scene: OpenedScene, points: np.ndarray) -> np.ndarray:
-    """The label of each of points [M, 3], i32 [M], of what the Gaussians around it mean; -1 where there is none.
+    """The label of each of points [M, 3], i32 [M], of what the Gaussians around it mean; -1 where
+    there is none.
 
     Args: scene: with semantics.
     """
@@ -120,4 +138,6 @@ def labels_at(scene: OpenedScene, points: np.ndarray) -> np.ndarray:
     held = scene.renderer
     gaussians = held.means, held.quats, held.scales, held.opacities, held.raw["features"]
     features, weights = features_at(points, *(part.numpy() for part in gaussians))
-    return np.where(weights > 0, decode_labels(features, scene.label_embeddings), -1).astype(np.int32)
+    return np.where(weights > 0, decode_labels(features, scene.label_embeddings), -1).astype(
+        np.int32
+    )

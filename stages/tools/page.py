@@ -1,4 +1,6 @@
-"""One HTML page of a scene that opens without a server: Gaussians, what they mean, and the words to ask them for."""
+"""One HTML page of a scene that opens without a server: Gaussians, what they mean, and the words to
+ask them for.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,14 @@ from chebsplat.formats.world import HERE, World
 from chebsplat.labels.calibration import Calibration
 from chebsplat.labels.names import folded
 from chebsplat.stages.pages.parts import rendered
-from chebsplat.stages.tools.query import are_words, embedded, is_closed, taught, teacher_of, understood
+from chebsplat.stages.tools.query import (
+    are_words,
+    embedded,
+    is_closed,
+    taught,
+    teacher_of,
+    understood,
+)
 from chebsplat.stages.tools.up import Up, up_of
 
 log = logging.getLogger("chebsplat")
@@ -36,10 +45,12 @@ WARM = 16  # colours of the scale of heat
 
 @dataclass
 class Words:
-    """What a page can be asked: L words, embeddings f32 [L, C], and f32 [K, C] of the phrases they are weighed against.
+    """What a page can be asked: L words, embeddings f32 [L, C], and f32 [K, C] of the phrases they
+    are weighed against.
 
     against: None where words are the scene's labels, each weighed against all others.
-    rivals, calibration: f32 [R, C] and coefficients, where the teacher's relevancy is calibrated: words but the
+    rivals, calibration: f32 [R, C] and coefficients, where the teacher's relevancy is calibrated:
+      words but the
     `uncalibrated` ones, rows of `words`, are answered in probabilities, as `query` does.
     """
 
@@ -60,8 +71,10 @@ def write_page(
 
     Args:
       scene:     from `Scene.read`, or `foreign`; name: the page's title.
-      teacher:   the scene's `features` artifact, whose teacher's words are embedded; None: the labels alone.
-      sh_degree: 0 or 1; phrases: what words are weighed against, as of `query`; more: words beside the teacher's own.
+      teacher:   the scene's `features` artifact, whose teacher's words are embedded; None: the
+        labels alone.
+      sh_degree: 0 or 1; phrases: what words are weighed against, as of `query`; more: words beside
+        the teacher's own.
       up:        against gravity; None: as the cameras were held.
     Returns: counts: Gaussians, views, labels, words, bytes.
     Raises:  InputError where the teacher is not the scene's or does not know a word.
@@ -82,10 +95,16 @@ def write_page(
     }  # fmt: skip
     counts = {"Gaussians": len(means), "views": len(scene.cameras.names)}
     words = None
-    if scene.labels is not None and scene.label_names is not None and scene.label_embeddings is not None:
+    if (
+        scene.labels is not None
+        and scene.label_names is not None
+        and scene.label_embeddings is not None
+    ):
         words = vocabulary(scene, teacher, list(phrases), list(more))
         colors = ["#" + bytes(color).hex() for color in palette(len(scene.label_names))]
-        about["labels"] = [{"name": n, "color": c} for n, c in zip(scene.label_names, colors, strict=True)]
+        about["labels"] = [
+            {"name": n, "color": c} for n, c in zip(scene.label_names, colors, strict=True)
+        ]
         about |= {"words": words.words, "against": words.against}
         about["warm"] = (warm(np.linspace(0, 1, WARM)[:, None]) / 255).round(4).tolist()
         embedded, steps = signed(words.embeddings)
@@ -97,7 +116,10 @@ def write_page(
             "labels": (scene.labels + 1).astype(np.uint16),
         }
         if words.calibration is not None and words.rivals is not None:
-            about |= {"calibration": words.calibration._asdict(), "uncalibrated": list(words.uncalibrated)}
+            about |= {
+                "calibration": words.calibration._asdict(),
+                "uncalibrated": list(words.uncalibrated),
+            }
             arrays["rivals"] = words.rivals.astype(np.float32)
         counts |= {"labels": len(scene.label_names), "words": len(words.words)}
     blob, about["places"] = to_bytes(arrays)
@@ -121,10 +143,11 @@ def write_page(
 
 
 def foreign(ply: Path, up: Up | None = None, world: World | None = None) -> Scene:
-    """A scene of a splat from elsewhere: no semantics, and one camera that sees its middle half, upright. world: to
-    bring it into, from that of its source; None: one that suits it.
+    """A scene of a splat from elsewhere: no semantics, and one camera that sees its middle half,
+    upright. world: to bring it into, from that of its source; None: one that suits it.
 
-    Raises: InputError naming the file. Choices: without `up` it is -y, as in COLMAP's and 3DGS' own frames.
+    Raises: InputError naming the file. Choices: without `up` it is -y, as in COLMAP's and 3DGS' own
+      frames.
     """
     chosen = world or HERE
     parameters, degree, _ = read_splats(ply, chosen)
@@ -140,17 +163,22 @@ def foreign(ply: Path, up: Up | None = None, world: World | None = None) -> Scen
     pose = np.eye(4)
     if up is not None:
         down = -up_of(up, parameters)
-        ahead = np.eye(3)[1 if abs(down[2]) > 0.9 else 2]  # along y where z is up, along z as in COLMAP otherwise
+        # along y where z is up, along z as in COLMAP otherwise
+        ahead = np.eye(3)[1 if abs(down[2]) > 0.9 else 2]
         ahead = ahead - (ahead @ down) * down
         ahead /= np.linalg.norm(ahead)
         pose[:3, :3] = [np.cross(down, ahead), down, ahead]
     pose[:3, 3] = [0, 0, 2 * max(float((high - low).max()), 1e-3)] - pose[:3, :3] @ (low + high) / 2
     K = np.array([[554.0, 0, 320], [0, 554, 240], [0, 0, 1]])  # 60 degrees across
-    return Scene(parameters, Cameras(["start"], K[None], pose[None], 640, 480), order, summary=chosen.notes)
+    return Scene(
+        parameters, Cameras(["start"], K[None], pose[None], 640, 480), order, summary=chosen.notes
+    )
 
 
 def camera_rows(scene: Scene, center: np.ndarray) -> np.ndarray:
-    """f32 [V, 16]: cam_from_world's three rows of a frame whose origin is `center`, then fx, fy, cx, cy."""
+    """f32 [V, 16]: cam_from_world's three rows of a frame whose origin is `center`, then fx, fy,
+    cx, cy.
+    """
     poses = scene.cameras.cam_from_world[:, :3].copy()
     poses[:, :, 3] += poses[:, :, :3] @ center
     Ks = scene.cameras.Ks
@@ -159,7 +187,9 @@ def camera_rows(scene: Scene, center: np.ndarray) -> np.ndarray:
 
 
 def up_and_extent(scene: Scene) -> tuple[np.ndarray, float]:
-    """Up, unit [3]: the mean of the views' own; and the longest side of the box of 90 % of the centres by each axis."""
+    """Up, unit [3]: the mean of the views' own; and the longest side of the box of 90 % of the
+    centres by each axis.
+    """
     up = -scene.cameras.cam_from_world[:, 1, :3].mean(0)
     length = np.linalg.norm(up)
     up = up / length if length > 0.1 else -scene.cameras.cam_from_world[0, 1, :3]
@@ -168,32 +198,48 @@ def up_and_extent(scene: Scene) -> tuple[np.ndarray, float]:
 
 
 def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: list[str]) -> Words:
-    """The words of a page: the scene's labels, the teacher's table (or nouns, by its text encoder), and `more`.
+    """The words of a page: the scene's labels, the teacher's table (or nouns, by its text encoder),
+    and `more`.
 
-    Raises: as `query.understood`; ConfigError on phrases or more where a scene knows its labels alone.
+    Raises: as `query.understood`; ConfigError on phrases or more where a scene knows its labels
+      alone.
     """
     names, rows = scene.label_names, scene.label_embeddings
     assert names is not None and rows is not None  # the caller's
     features, model = (None, None) if teacher is None else taught(teacher)
     if teacher is None or features is None or is_closed(features):
         if phrases or more:
-            raise ConfigError("this scene knows its labels and no other words; leave out --against and --words")
-        log.info("only the scene's labels can be asked for%s", "" if teacher else ": it has no teacher's artifact")
+            raise ConfigError(
+                "this scene knows its labels and no other words; leave out --against and --words"
+            )
+        log.info(
+            "only the scene's labels can be asked for%s",
+            "" if teacher else ": it has no teacher's artifact",
+        )
         return Words(names, rows, None, rows)
     known = {folded(name) for name in names}
-    others = [word for word in dict.fromkeys([*more, *table_words(model)]) if folded(word) not in known]
+    others = [
+        word for word in dict.fromkeys([*more, *table_words(model)]) if folded(word) not in known
+    ]
     weighed = understood(teacher, others[0], phrases, calibrated=False)
     found = embedded(others, features, model)
     order = sorted(range(len(names) + len(others)), key=[*names, *others].__getitem__)
     every = [*names, *others]
-    words = Words([every[k] for k in order], np.concatenate([rows, found])[order], weighed.phrases, weighed.against)
+    words = Words(
+        [every[k] for k in order],
+        np.concatenate([rows, found])[order],
+        weighed.phrases,
+        weighed.against,
+    )
     held = teacher_of(features, model)
     if not phrases and (calibration := calibration_of(held.path)) is not None:
         words.rivals, words.calibration = (
             embedded(calibration.rivals, features, model),
             Calibration(**calibration.calibration),
         )
-        words.uncalibrated = [k for k, known in enumerate(are_words(words.words, held)) if not known]
+        words.uncalibrated = [
+            k for k, known in enumerate(are_words(words.words, held)) if not known
+        ]
     return words
 
 
@@ -208,7 +254,9 @@ def weighed(words: Words | None) -> str:
 
 
 def table_words(model: str | None) -> list[str]:
-    """The words that a teacher knows as they are; indoor nouns where it has a text encoder and no table."""
+    """The words that a teacher knows as they are; indoor nouns where it has a text encoder and no
+    table.
+    """
     teacher = read_teacher(Path(model) if model else EMBEDDED)
     if teacher.labels is not None:
         names, embeddings = read_label_table(teacher.labels)

@@ -26,10 +26,13 @@ CANONICAL = ("object", "things", "stuff", "texture")  # LERF's: phrases that fit
 
 @dataclass
 class Query:
-    """A query in a scene's own channels: what is asked for [C], and what it is weighed against [K, C].
+    """A query in a scene's own channels: what is asked for [C], and what it is weighed against [K,
+    C].
 
-    rivals, calibration: f32 [R, C] and coefficients of the teacher, where its relevancy is calibrated and the text is a
-    word of it; None: scores are LERF's relevancy. closed: the scene knows its labels alone, and this is one of them.
+    rivals, calibration: f32 [R, C] and coefficients of the teacher, where its relevancy is
+      calibrated and the text is a
+    word of it; None: scores are LERF's relevancy. closed: the scene knows its labels alone, and
+    this is one of them.
     """
 
     text: str
@@ -41,7 +44,9 @@ class Query:
     closed: bool = False
 
     def scores(self, features: np.ndarray) -> np.ndarray:
-        """f32 [...] in [0, 1] of features [..., C]: how likely each is what the words mean, or its relevancy."""
+        """f32 [...] in [0, 1] of features [..., C]: how likely each is what the words mean, or its
+        relevancy.
+        """
         if self.calibration is None or self.rivals is None:
             return relevancy(features, self.embedding, self.against)
         return probability(features, self.embedding, self.rivals, self.calibration)
@@ -51,17 +56,22 @@ class Query:
         scores = self.scores(features)
         if self.calibration is not None:
             return Relevancy(self.text, scores, True, presence(scores, self.calibration))
-        return Relevancy(self.text, scores, False, float((scores > CUT).any()) if self.closed else None)
+        return Relevancy(
+            self.text, scores, False, float((scores > CUT).any()) if self.closed else None
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Relevancy:
     """How a scene answers to a query.
 
-    scores:     f32 [N] in [0, 1] of every Gaussian: how likely it is what the words mean, where that is calibrated;
-                otherwise LERF's relevancy, above 0.5 where the words fit better than all that they are weighed against.
+    scores:     f32 [N] in [0, 1] of every Gaussian: how likely it is what the words mean, where
+      that is calibrated;
+                otherwise LERF's relevancy, above 0.5 where the words fit better than all that they
+                are weighed against.
     calibrated: whether scores are probabilities.
-    presence:   how likely the scene has it at all, in [0, 1]; None where nobody has calibrated that.
+    presence:   how likely the scene has it at all, in [0, 1]; None where nobody has calibrated
+      that.
     """
 
     text: str
@@ -87,44 +97,70 @@ class Relevancy:
 
     def __str__(self) -> str:
         count = int(self.selected.sum())
-        what = f"are likelier than not {self.text!r}" if self.calibrated else f"have a relevancy above {self.cut}"
+        what = (
+            f"are likelier than not {self.text!r}"
+            if self.calibrated
+            else (f"have a relevancy above {self.cut}")
+        )
         text = f"{count} of {len(self.scores)} Gaussians {what}"
         if self.presence is None:
             return f"{text}; uncalibrated: there may be none in the scene"
-        return text if self.present else f"{text}; {self.text!r} is probably not here ({self.presence:.0%})"
+        return (
+            text
+            if self.present
+            else (f"{text}; {self.text!r} is probably not here ({self.presence:.0%})")
+        )
 
 
 def taught(path: Path) -> tuple[Features, str | None]:
-    """A scene's `features` artifact, and the model that it was made with; None: the embedded one."""
+    """A scene's `features` artifact, and the model that it was made with; None: the embedded
+    one.
+    """
     return Features.read(path), read_manifest(path).config["teacher"]["model"]
 
 
 def is_closed(features: Features) -> bool:
     """Whether the teacher knows its labels and no other words."""
-    return features.convention["kind"] in ("labels", "given") or features.convention.get("output") == "logits"
+    return (
+        features.convention["kind"] in ("labels", "given")
+        or features.convention.get("output") == "logits"
+    )
 
 
 def understood(path: Path, text: str, phrases: list[str], calibrated: bool = True) -> Query:
     """The words as vectors of the scene's channels, by the teacher that the scene was trained from.
 
     Args: calibrated: whether the calibration of the teacher is taken where there is one.
-    Choices: what `phrases` say is weighed against these, by LERF's relevancy; so is a phrase that is no word of the
-      teacher's table, for which no calibration speaks, against LERF's phrases.
+    Choices: what `phrases` say is weighed against these, by LERF's relevancy; so is a phrase that
+      is no word of the teacher's table, for which no calibration speaks, against LERF's phrases.
     """
     features, model = taught(path)
     if is_closed(features):
         return among_labels(features, text, phrases)
     teacher = teacher_of(features, model)
-    found = calibration_of(teacher.path) if calibrated and not phrases and all(are_words([text], teacher)) else None
+    found = (
+        calibration_of(teacher.path)
+        if calibrated and not phrases and all(are_words([text], teacher))
+        else None
+    )
     if found is not None:
         vectors = embedded([text, *found.rivals], features, model)
-        return Query(text, vectors[0], found.rivals, vectors[1:], vectors[1:], Calibration(**found.calibration))
+        return Query(
+            text,
+            vectors[0],
+            found.rivals,
+            vectors[1:],
+            vectors[1:],
+            Calibration(**found.calibration),
+        )
     try:
         vectors = embedded([text, *(phrases or CANONICAL)], features, model)
     except InputError as error:
         if phrases or repr(CANONICAL[0]) not in str(error):
             raise
-        raise InputError(f"{error}; or choose with --against what the query is weighed against") from None
+        raise InputError(
+            f"{error}; or choose with --against what the query is weighed against"
+        ) from None
     return Query(text, vectors[0], phrases or list(CANONICAL), vectors[1:])
 
 
@@ -132,19 +168,25 @@ def teacher_of(features: Features, model: str | None) -> TeacherModel:
     """The ONNX teacher of a scene's features. Raises InputError if it is no longer the same."""
     teacher = read_teacher(Path(model) if model else EMBEDDED)
     if model_sha256(teacher.path) != features.convention["sha256"]:
-        raise InputError(f"{teacher.path} is not the model that this scene was trained from; run the scene again")
+        raise InputError(
+            f"{teacher.path} is not the model that this scene was trained from; run the scene again"
+        )
     return teacher
 
 
 def are_words(texts: list[str], teacher: TeacherModel) -> list[bool]:
-    """Whether each is one of the words that a calibration speaks for: those of the teacher's table, if it has one."""
+    """Whether each is one of the words that a calibration speaks for: those of the teacher's table,
+    if it has one.
+    """
     if teacher.labels is None:
         return [True] * len(texts)
     return [row >= 0 for row in found(texts, read_label_table(teacher.labels)[0], False)]
 
 
 def embedded(words: list[str], features: Features, model: str | None) -> np.ndarray:
-    """Words [L] -> f32 [L, C] by the text space of the ONNX teacher. Raises InputError if it is no longer the same."""
+    """Words [L] -> f32 [L, C] by the text space of the ONNX teacher. Raises InputError if it is no
+    longer the same.
+    """
     vectors = text_embeddings(words, teacher_of(features, model))
     if features.channels is not None:
         vectors = features.channels.embed(vectors)
@@ -162,13 +204,17 @@ def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
         if row < 0:
             near = suggest(folded(word), map(folded, names))
             raise ConfigError(
-                f"{word!r} is no label of this scene, and its teacher (kind {features.convention['kind']}) knows no "
-                f"other words{'; near: ' + ', '.join(near) if near else ''}. Labels: {', '.join(names)}. For free text "
+                f"{word!r} is no label of this scene, and its teacher (kind "
+                f"{features.convention['kind']}) knows no "
+                f"other words{'; near: ' + ', '.join(near) if near else ''}. Labels: "
+                f"{', '.join(names)}. For free text "
                 "run the scene with teacher.kind=auto"
             )
     others = others or [k for k in range(len(names)) if k != target]
     if not others:
-        raise ConfigError(f"{text!r} is the scene's only label: there is nothing to weigh it against")
+        raise ConfigError(
+            f"{text!r} is the scene's only label: there is nothing to weigh it against"
+        )
     return Query(text, features.label_embeddings[target], [names[k] for k in others], features.label_embeddings[others],
                  closed=not phrases)  # fmt: skip
 

@@ -1,4 +1,6 @@
-"""A finished scene, opened: render it, ask it, take a part of it. Nothing is written but by `to_ply`."""
+"""A finished scene, opened: render it, ask it, take a part of it. Nothing is written but by
+`to_ply`.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,8 @@ COVERED = 0.5  # of a pixel, below which it has no label
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera in OpenCV's frame. K [3, 3] pixels (the centre of the first one at 0.5, 0.5), cam_from_world
-    [4, 4] scene units, size in pixels.
+    """A pinhole camera in OpenCV's frame. K [3, 3] pixels (the centre of the first one at 0.5,
+    0.5), cam_from_world [4, 4] scene units, size in pixels.
     """
 
     name: str
@@ -58,9 +60,10 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a camera sees. color u8 [H, W, 3]; depth f32 [H, W] along its axis, scene units, nan where nothing is;
-    alpha f32 [H, W], how far each pixel is covered; where there are semantics features f32 [H, W, C] and labels i32
-    [H, W], rows of `label_names`, -1 where a pixel is less than half covered.
+    """What a camera sees. color u8 [H, W, 3]; depth f32 [H, W] along its axis, scene units, nan
+    where nothing is; alpha f32 [H, W], how far each pixel is covered; where there are semantics
+    features f32 [H, W, C] and labels i32 [H, W], rows of `label_names`, -1 where a pixel is less
+    than half covered.
     """
 
     color: np.ndarray
@@ -73,14 +76,20 @@ class Picture:
 class OpenedScene:
     """N Gaussians with their colours and, where there is a teacher, what they mean.
 
-    parameters: raw, as `formats.scene.Scene` holds them; `features` f32 [N, C], `labels` i32 [N] (-1: none) and
-    `label_names` and `label_embeddings` f32 [L, C] are None without semantics; `cameras`: of the capture, in its order.
-    Parameters are in the scene's own world; cameras, points, boxes, depth and files in that of its source (`world`).
+    parameters: raw, as `formats.scene.Scene` holds them; `features` f32 [N, C], `labels` i32 [N]
+      (-1: none) and
+    `label_names` and `label_embeddings` f32 [L, C] are None without semantics; `cameras`: of the
+    capture, in its order. Parameters are in the scene's own world; cameras, points, boxes, depth
+    and files in that of its source (`world`).
     """
 
     def __init__(self, scene: Scene, source: Path, teacher: Path | None = None):
         self.source, self.exported, self._teacher = source, scene, teacher
-        self.parameters, self.labels, self.label_names = scene.parameters, scene.labels, scene.label_names
+        self.parameters, self.labels, self.label_names = (
+            scene.parameters,
+            scene.labels,
+            scene.label_names,
+        )
         self.label_embeddings, held = scene.label_embeddings, scene.cameras
         self.world = World.read(scene.summary)
         views = zip(held.names, held.Ks, self.world.poses_outward(held.cam_from_world), strict=True)
@@ -107,7 +116,9 @@ class OpenedScene:
         found = [camera for camera in self.cameras if camera.name == name]
         if not found:
             near = ", ".join(suggest(name, [camera.name for camera in self.cameras]))
-            raise ConfigError(f"{self.source} has no view {name}" + (f"; near: {near}" if near else ""))
+            raise ConfigError(
+                f"{self.source} has no view {name}" + (f"; near: {near}" if near else "")
+            )
         return found[0]
 
     def inside(self, camera: Camera) -> Camera:
@@ -130,14 +141,19 @@ class OpenedScene:
         return Picture(color, depth, alpha, features, np.where(alpha < COVERED, -1, labels))
 
     def query(self, text: str, against: Sequence[str] = ()) -> np.ndarray:
-        """How likely each Gaussian is what the words mean, f32 [N] in [0, 1]: the scores of `ask`."""
+        """How likely each Gaussian is what the words mean, f32 [N] in [0, 1]: the scores of
+        `ask`.
+        """
         return self.ask(text, against).scores
 
     def ask(self, text: str, against: Sequence[str] = ()) -> Relevancy:
-        """What the scene answers to words: scores, a cut, what is selected, and whether the scene has it at all.
+        """What the scene answers to words: scores, a cut, what is selected, and whether the scene
+        has it at all.
 
-        Args: against: what the words are weighed against, by LERF's relevancy; default: the calibration of the scene's
-              teacher; where it has none, or the words are a phrase, LERF's phrases; or all other labels.
+        Args: against: what the words are weighed against, by LERF's relevancy; default: the
+          calibration of the scene's
+              teacher; where it has none, or the words are a phrase, LERF's phrases; or all other
+              labels.
         Raises: ConfigError without semantics, or on words that the scene's teacher cannot know.
         """
         asked = self.understood(text, against)
@@ -149,7 +165,9 @@ class OpenedScene:
         if self.features is None:
             raise ConfigError(f"{self.source} has no semantics; train the scene with a teacher")
         if self._teacher is None:
-            raise ConfigError(f"{self.source} has no teacher's artifact beside it; open the scene's folder")
+            raise ConfigError(
+                f"{self.source} has no teacher's artifact beside it; open the scene's folder"
+            )
         if not text.strip():
             raise ConfigError("the query is empty; say what to look for")
         return understood(self._teacher, text.strip(), list(against))
@@ -164,26 +182,38 @@ class OpenedScene:
     ) -> OpenedScene:
         """The Gaussians that pass every filter, as a scene; it shares no memory with this one.
 
-        Args: mask: bool [N]; label: names to keep; min_opacity: in [0, 1]; box: x0, y0, z0, x1, y1, z1 of centres.
-        Raises: ConfigError on a label that is not there or a filter that is none; DataFailure if nothing is left.
+        Args: mask: bool [N]; label: names to keep; min_opacity: in [0, 1]; box: x0, y0, z0, x1, y1,
+          z1 of centres.
+        Raises: ConfigError on a label that is not there or a filter that is none; DataFailure if
+          nothing is left.
         """
         names = () if label is None else (label,) if isinstance(label, str) else tuple(label)
         filters = passing(self.exported, self.source, names, min_opacity, box)
         if mask is not None:
             filters["mask"] = mask = np.asarray(mask)
             if mask.shape != (len(self),) or mask.dtype != bool:
-                raise ConfigError(f"a mask bool [{len(self)}] is needed, not {mask.dtype} {list(mask.shape)}")
+                raise ConfigError(
+                    f"a mask bool [{len(self)}] is needed, not {mask.dtype} {list(mask.shape)}"
+                )
         return self.part(filters)
 
     def part(self, filters: Mapping[str, np.ndarray]) -> OpenedScene:
-        """The Gaussians that pass all of some filters, bool [N] by name. Raises DataFailure where none does."""
+        """The Gaussians that pass all of some filters, bool [N] by name. Raises DataFailure where
+        none does.
+        """
         kept = np.logical_and.reduce([np.ones(len(self), bool), *filters.values()])
         if not kept.any():
             means = self.parameters["means"]
-            low, high = (",".join(f"{value:.4g}" for value in side) for side in (means.min(0), means.max(0)))
-            why = ", ".join(f"{name} leaves out {int((~keep).sum())}" for name, keep in filters.items())
+            low, high = (
+                ",".join(f"{value:.4g}" for value in side) for side in (means.min(0), means.max(0))
+            )
+            why = ", ".join(
+                f"{name} leaves out {int((~keep).sum())}" for name, keep in filters.items()
+            )
             where = f"centres lie from {low} to {high}"
-            raise DataFailure(f"no Gaussian of {len(self)} is left ({why}); {where}: choose wider filters")
+            raise DataFailure(
+                f"no Gaussian of {len(self)} is left ({why}); {where}: choose wider filters"
+            )
         parameters = {name: values[kept] for name, values in self.parameters.items()}
         part = replace(
             self.exported,
@@ -194,12 +224,16 @@ class OpenedScene:
         return OpenedScene(part, self.source, self._teacher)
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres [N, 3], f32, or f64 where the source's world is another, and colours u8 [N, 3] of SH degree 0."""
+        """Centres [N, 3], f32, or f64 where the source's world is another, and colours u8 [N, 3] of
+        SH degree 0.
+        """
         means = self.world.outward(self.parameters["means"])
         return means, np.round(surface_of(self.parameters)[1] * 255).astype(np.uint8)
 
     def to_ply(self, path: str | Path) -> Path:
-        """Write a 3DGS PLY with labels, trimmed to the highest SH degree in use; raises ConfigError if it exists."""
+        """Write a 3DGS PLY with labels, trimmed to the highest SH degree in use; raises ConfigError
+        if it exists.
+        """
         path = Path(path)
         if path.exists():
             raise ConfigError(f"{path} exists; remove it, or choose another path")
@@ -210,14 +244,24 @@ class OpenedScene:
 
 
 def passing(
-    scene: Scene, path: Path, labels: tuple[str, ...], min_opacity: float, box: Sequence[float] | None
+    scene: Scene,
+    path: Path,
+    labels: tuple[str, ...],
+    min_opacity: float,
+    box: Sequence[float] | None,
 ) -> dict[str, np.ndarray]:
-    """Which Gaussians pass each filter that is asked for, bool [N] by its name. Args and errors: see `extract`."""
+    """Which Gaussians pass each filter that is asked for, bool [N] by its name. Args and errors:
+    see `extract`.
+    """
     filters: dict[str, np.ndarray] = {}
     if not 0 <= min_opacity <= 1:
         raise ConfigError(f"an opacity of at least {min_opacity:g}: a number from 0 to 1 is needed")
-    if box is not None and not (len(box) == 6 and np.isfinite(box).all() and np.less(box[:3], box[3:]).all()):
-        raise ConfigError(f"a box of {list(box)}: six numbers x0,y0,z0,x1,y1,z1 with x0 < x1 and so on are needed")
+    if box is not None and not (
+        len(box) == 6 and np.isfinite(box).all() and np.less(box[:3], box[3:]).all()
+    ):
+        raise ConfigError(
+            f"a box of {list(box)}: six numbers x0,y0,z0,x1,y1,z1 with x0 < x1 and so on are needed"
+        )
     if labels:
         filters["label"] = has_label(scene, path, labels)
     if min_opacity > 0:
@@ -229,12 +273,16 @@ def passing(
 
 
 def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
-    """Which Gaussians bear one of the names. Raises ConfigError, with the nearest name, for one that is unknown."""
+    """Which Gaussians bear one of the names. Raises ConfigError, with the nearest name, for one
+    that is unknown.
+    """
     if scene.labels is None or scene.label_names is None:
         why = scene.summary.get("left_out", {}).get("labels", "it has no semantics")
         raise ConfigError(f"{path} has no labels: {why}")
     for name in lacking(names, scene.label_names):
         near = suggest(name, scene.label_names, 1)
-        advice = f"did you mean {near[0]}?" if near else f"there are: {', '.join(scene.label_names)}"
+        advice = (
+            f"did you mean {near[0]}?" if near else (f"there are: {', '.join(scene.label_names)}")
+        )
         raise ConfigError(f"no label is called {name}; {advice}")
     return np.isin(scene.labels, rows_of(names, scene.label_names))

@@ -17,12 +17,14 @@ LEAST_SURE = 0.5  # of `cameras.common_up`, below which cameras do not tell
 Up = np.ndarray | str  # unit [3], or "auto"
 
 
-def up_of(asked: Up, parameters: dict[str, np.ndarray], poses: np.ndarray | None = None) -> np.ndarray:
+def up_of(
+    asked: Up, parameters: dict[str, np.ndarray], poses: np.ndarray | None = None
+) -> np.ndarray:
     """The unit vector against gravity [3] that is asked for, of a scene of these raw parameters.
 
     Args: poses: cam_from_world [V, 4, 4], where views were taken from.
-    Choices: `auto` is by the cameras, held upright, where they tell; otherwise across the floor's plane, on the side of
-      the cameras' tops where these lean to one. A line says which.
+    Choices: `auto` is by the cameras, held upright, where they tell; otherwise across the floor's
+      plane, on the side of the cameras' tops where these lean to one. A line says which.
     """
     if not isinstance(asked, str):
         return asked
@@ -33,9 +35,17 @@ def up_of(asked: Up, parameters: dict[str, np.ndarray], poses: np.ndarray | None
             return up
     scales = np.sort(np.exp(parameters["log_scales"].astype(np.float64)), 1)
     flat = (1 - scales[:, 0] / scales[:, 1].clip(1e-30)) * scales[:, 1] * scales[:, 2]
-    weights = flat.clip(0, np.quantile(flat, 0.98)) * expit(parameters["logit_opacities"].astype(np.float64))
-    up = floor_up(parameters["means"].astype(np.float64), surface_of(parameters)[0], weights + 1e-12)
-    if poses is not None and len(poses) > 1 and (lean := float(-poses[:, 1, :3].mean(0) @ up)) < -LEAST_SURE:
+    weights = flat.clip(0, np.quantile(flat, 0.98)) * expit(
+        parameters["logit_opacities"].astype(np.float64)
+    )
+    up = floor_up(
+        parameters["means"].astype(np.float64), surface_of(parameters)[0], weights + 1e-12
+    )
+    if (
+        poses is not None
+        and len(poses) > 1
+        and (lean := float(-poses[:, 1, :3].mean(0) @ up)) < -LEAST_SURE
+    ):
         log.info("the cameras' tops lean to the other side of the floor (%.2f)", lean)
         up = -up
     log.info("up is %s, by the floor (--up auto)", told(up))

@@ -1,4 +1,6 @@
-"""From artifacts and settings to a trainer before its first step: one way for the stage and for every benchmark."""
+"""From artifacts and settings to a trainer before its first step: one way for the stage and for
+every benchmark.
+"""
 
 from __future__ import annotations
 
@@ -49,19 +51,24 @@ class Inputs:
 
 
 def read_inputs(job: Job) -> Inputs:
-    """The artifacts that this training reads, and as many of the points as `train.max_gaussians` lets in.
+    """The artifacts that this training reads, and as many of the points as `train.max_gaussians`
+    lets in.
 
     Raises: InputError if artifacts do not belong together or are damaged.
     """
     train = job.config.train
-    capture, points = Capture.read(job.inputs["capture"]), within_cap(job, Points.read(job.inputs["points"]))
+    capture, points = (
+        Capture.read(job.inputs["capture"]),
+        within_cap(job, Points.read(job.inputs["points"])),
+    )
     taught = "features" in job.inputs and train.semantics and train.features == "trained"
     features = Features.read(job.inputs["features"]) if taught else None
     return Inputs(capture, points, features)
 
 
 def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
-    """A trainer before its first step, its open settings resolved; they, and what is off and why, become facts.
+    """A trainer before its first step, its open settings resolved; they, and what is off and why,
+    become facts.
 
     Args: backend: of `rasterize`.
     Raises: ConfigError, InputError or DataFailure, as its parts do.
@@ -73,12 +80,15 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
     train = resolved(job.config.train, replace(evidence, exposure_spread=stops))
     job.facts["decided"] = decided(job.config.train, train, features is not None)
     _note_left_out(job, train, features is not None, evidence.no_depth)
-    torch.set_num_threads(n_threads())  # sums of torch depend on it; the same bytes are promised for the same number
+    # sums of torch depend on it; the same bytes are promised for the same number
+    torch.set_num_threads(n_threads())
     model = model_of(points, features, train, job.config.describe, job.device, backend, capture)
     undone = exposures if train.exposure == "measured" else None
     if undone is not None:
         log.info("exposures of photos differ by %.2f stops from those about them: undone", stops)
-    views = training_views(capture, points, features, bool(train.weight_depth), undone).to(job.device)
+    views = training_views(capture, points, features, bool(train.weight_depth), undone).to(
+        job.device
+    )
     if features is not None and train.feature_start == "lifted":
         if not start_features(model, capture, points, features, job.progress):
             job.left_out("lifted start of features", "no training view says anything of a Gaussian")
@@ -107,8 +117,8 @@ def knowledge_of(earlier: Path, model: PrintedScene) -> dict[str, Tensor]:
 
 
 def _exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
-    """Differences of training photos' exposures from their neighbours' [V, 3], stops; None: not measured. The spread
-    becomes a fact.
+    """Differences of training photos' exposures from their neighbours' [V, 3], stops; None: not
+    measured. The spread becomes a fact.
     """
     wanted = job.config.train.exposure
     if wanted == "off" or (wanted == "auto" and capture.source.get("kind") == "generated"):
@@ -118,7 +128,9 @@ def _exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
 
 
 def _why_no_exposure(given: TrainSection, stops: float | None) -> str:
-    """Reason for leaving photos' exposures as they are. stops: their spread, where it was measured."""
+    """Reason for leaving photos' exposures as they are. stops: their spread, where it was
+    measured.
+    """
     if stops is not None:
         return f"photos differ by {stops:.2f} stops from those about them"
     return "train.exposure is off" if given.exposure == "off" else "views are generated, all alike"
@@ -133,11 +145,18 @@ def _note_left_out(job: Job, train: TrainSection, has_semantics: bool, no_depth:
             job.left_out(what, PRINTED_METHOD)
     else:
         if not train.weight_depth:
-            job.left_out("depth loss", "train.weight_depth is 0" if given.weight_depth is not None else no_depth)
+            job.left_out(
+                "depth loss",
+                "train.weight_depth is 0" if given.weight_depth is not None else no_depth,
+            )
         if train.exposure == "off":
             job.left_out("exposure by photo", _why_no_exposure(given, stops))
     if not has_semantics:
-        why = "no teacher features: rendering only" if train.semantics else "train.semantics is false"
+        why = (
+            "no teacher features: rendering only"
+            if train.semantics
+            else ("train.semantics is false")
+        )
         if train.semantics and train.features == "lifted":
             why = "train.features is lifted: they follow the training"
         job.left_out("semantic branch", why)
@@ -163,8 +182,10 @@ def model_of(
     backend: str = "auto",
     capture: Capture | None = None,
 ) -> SceneModel:
-    """The scene before training: a Gaussian at each point, or those of `train.start`; modules drawn by the training's
-    seed. train: resolved; backend: of `rasterize`; capture: that shows in which frame `train.start` lies.
+    """The scene before training: a Gaussian at each point, or those of `train.start`; modules drawn
+    by the training's
+    seed. train: resolved; backend: of `rasterize`; capture: that shows in which frame `train.start`
+      lies.
     """
     torch.manual_seed(train.seed)
     if train.start:
@@ -177,11 +198,16 @@ def model_of(
         if features is None:
             raise ConfigError("train.method = printed is semantic: it needs a teacher")
         return PrintedScene(raw, describe, train, features.features.shape[-1], backend)
-    return SceneModel(raw, describe, train, None if features is None else features.features.shape[-1], backend)
+    return SceneModel(
+        raw, describe, train, None if features is None else features.features.shape[-1], backend
+    )
 
 
-def start_features(model: SceneModel, capture: Capture, points: Points, features: Features, progress: Progress) -> int:
-    """Features begin as what the teacher says of the Gaussians where they are, by one pass over the training views.
+def start_features(
+    model: SceneModel, capture: Capture, points: Points, features: Features, progress: Progress
+) -> int:
+    """Features begin as what the teacher says of the Gaussians where they are, by one pass over the
+    training views.
 
     Returns: of how many Gaussians anything is said.
     Choices: means of the views, without steps towards their median: training follows.
@@ -198,12 +224,16 @@ def start_features(model: SceneModel, capture: Capture, points: Points, features
     return int(lifted.features.any(1).sum())
 
 
-def started(ply: Path, points: Points, train: TrainSection, capture: Capture | None) -> dict[str, Tensor]:
-    """Raw parameters of the Gaussians of a splat, brought into the frame of the scene's cameras, with its SH bands.
+def started(
+    ply: Path, points: Points, train: TrainSection, capture: Capture | None
+) -> dict[str, Tensor]:
+    """Raw parameters of the Gaussians of a splat, brought into the frame of the scene's cameras,
+    with its SH bands.
 
-    Raises: InputError naming the file, as `in_frame` does; ConfigError where they are more than `train.max_gaussians`.
-    Choices: Gaussians of one colour, which tells nothing, take that of the nearest of the scene's points: a training
-      moves colours too slowly to find them.
+    Raises: InputError naming the file, as `in_frame` does; ConfigError where they are more than
+      `train.max_gaussians`.
+    Choices: Gaussians of one colour, which tells nothing, take that of the nearest of the scene's
+      points: a training moves colours too slowly to find them.
     """
     world = HERE if capture is None else World.read(capture.source)
     parameters, degree, _ = read_splats(ply, world)
@@ -216,12 +246,17 @@ def started(ply: Path, points: Points, train: TrainSection, capture: Capture | N
         cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
         theirs = read_splats(ply)[0] if world.notes else None
         parameters = in_frame(ply, parameters, capture, cameras, points.means, theirs)
-    raw = {name: parameters[name] for name in ("means", "log_scales", "quats", "logit_opacities", "sh0")}
+    raw = {
+        name: parameters[name]
+        for name in ("means", "log_scales", "quats", "logit_opacities", "sh0")
+    }
     for band in range(1, min(degree, train.sh_degree) + 1):
         raw[f"sh{band}"] = parameters["shN"][:, band**2 - 1 : (band + 1) ** 2 - 1]
     colors = surface_of(parameters)[1]
     if np.abs(colors - np.median(colors, 0)).mean() < 1 / 255:
-        log.warning("%s has Gaussians of one colour; they take those of the points beside them", ply)
+        log.warning(
+            "%s has Gaussians of one colour; they take those of the points beside them", ply
+        )
         raw["sh0"] = sh0_of(points.colors[cKDTree(points.means).query(parameters["means"])[1]])
     return {name: torch.tensor(values, dtype=torch.float32) for name, values in raw.items()}
 

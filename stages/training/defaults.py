@@ -30,7 +30,8 @@ class Evidence:
     n_views, n_pixels: of the training photos, in all.
     points_measured: initial points lie on measured surfaces.
     no_depth: why measured depth is not relied on ("": it is).
-    labels: where labels with a confidence come from: `none`, `taught`, `given` (by the source); None: no teacher.
+    labels: where labels with a confidence come from: `none`, `taught`, `given` (by the source);
+      None: no teacher.
     exposure_spread: of the photos' own exposures, stops; None: not measured.
     """
 
@@ -44,29 +45,33 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Default:
-    """Rule for an open setting: `value` of the section so far and the evidence; `by`: in words, for the docs."""
+    """Rule for an open setting: `value` of the section so far and the evidence; `by`: in words, for
+    the docs.
+    """
 
     value: Callable[[TrainSection, Evidence], Any]
     by: str
 
 
 def _steps(_: TrainSection, evidence: Evidence) -> int:
-    """By held-out training views (docs/results/training.md, "How many steps"): the more there is to see, the longer a
-    training gains. 70 photos of 320×240 pixels are best served by 1500 steps, and with 3000 lose 0.5 dB again; 43 of
-    360×640 gain until 3000.
+    """By held-out training views (docs/results/training.md, "How many steps"): the more there is to
+    see, the longer a training gains. 70 photos of 320×240 pixels are best served by 1500 steps, and
+    with 3000 lose 0.5 dB again; 43 of 360×640 gain until 3000.
     """
     return min(max(100 * round(2.8 * evidence.n_pixels / 1e6), FEWEST), MOST_STEPS)
 
 
 def _feature_every(_: TrainSection, evidence: Evidence) -> int:
-    """One step in four teaches features as well as every one, for less than half of what they add to a step's time.
-    Where views are few, features hold the Gaussians in place, too (ten views: 24.3 dB, and 23.1 in one of four).
+    """One step in four teaches features as well as every one, for less than half of what they add
+    to a step's time. Where views are few, features hold the Gaussians in place, too (ten views:
+    24.3 dB, and 23.1 in one of four).
     """
     return min(max(evidence.n_views // 10, 1), 4)
 
 
 def _feature_start(_: TrainSection, evidence: Evidence) -> str:
-    """Where views are few, features that are there from the first step pull Gaussians towards what single views show
+    """Where views are few, features that are there from the first step pull Gaussians towards what
+    single views show
     (six, ten, twenty views of one room: 3.6, 3.6 and 1.0 dB less; seventy: none).
     """
     return "lifted" if evidence.n_views >= LIFTED_FROM else "zero"
@@ -75,15 +80,18 @@ def _feature_start(_: TrainSection, evidence: Evidence) -> str:
 def _by_steps(published: float, power: float) -> Default:
     """A rate of 3DGS's for trainings of fewer steps, which must each go further.
 
-    Powers are from 1000-step trainings of office0 and fox, where means 8 times, scales and rotations 3 times and
-    colours 4 times as fast were best on held-out training views; 1 from 30,000 steps on.
+    Powers are from 1000-step trainings of office0 and fox, where means 8 times, scales and
+    rotations 3 times and colours 4 times as fast were best on held-out training views; 1 from
+    30,000 steps on.
     """
 
     def rate(train: TrainSection, _: Evidence) -> float:
         assert train.steps is not None
         return published * max(PUBLISHED / max(train.steps, FEWEST), 1) ** power
 
-    return Default(rate, f"steps, taken as {FEWEST} to 30,000: {published:g} (30,000 / steps)^{power:g}")
+    return Default(
+        rate, f"steps, taken as {FEWEST} to 30,000: {published:g} (30,000 / steps)^{power:g}"
+    )
 
 
 def _features_rate(train: TrainSection, _: Evidence) -> float:
@@ -98,7 +106,9 @@ def _exposure(_: TrainSection, evidence: Evidence) -> str:
 
 DEFAULTS = {  # in this order: a later one may ask for an earlier
     "steps": Default(_steps, "pixels of the training photos: 280 a megapixel, from 1000 to 3000"),
-    "feature_every": Default(_feature_every, "training views: a tenth of their number, from 1 to 4"),
+    "feature_every": Default(
+        _feature_every, "training views: a tenth of their number, from 1 to 4"
+    ),
     "feature_start": Default(_feature_start, "training views: lifted from 40 on, otherwise zero"),
     "feature_loss": Default(
         lambda _, evidence: "cross-entropy" if evidence.labels == "given" else "length",
@@ -106,19 +116,26 @@ DEFAULTS = {  # in this order: a later one may ask for an earlier
     ),
     "opacity": Default(
         lambda _, evidence: 0.7 if evidence.points_measured else 0.3,
-        "initial points: 0.7 where depth is measured, since there is a surface at each, otherwise 0.3",
+        "initial points: 0.7 where depth is measured, since there is a surface at each, otherwise "
+        "0.3",
     ),
     "weight_depth": Default(
         lambda _, evidence: 0.0 if evidence.no_depth else DEPTH_WEIGHT,
-        f"depth: {DEPTH_WEIGHT} where there is any and views agree on it to {MOST_APART:.1%}, otherwise 0",
+        f"depth: {DEPTH_WEIGHT} where there is any and views agree on it to {MOST_APART:.1%}, "
+        "otherwise 0",
     ),
-    "exposure": Default(_exposure, f"photos: measured where they differ by {LEAST_SPREAD} stops from those about them"),
+    "exposure": Default(
+        _exposure,
+        f"photos: measured where they differ by {LEAST_SPREAD} stops from those about them",
+    ),
     "lr_means": _by_steps(1.6e-4, 0.61),
     "lr_scales": _by_steps(5e-3, 0.52),
     "lr_quats": _by_steps(1e-3, 0.52),
     "lr_sh0": _by_steps(2.5e-3, 0.41),
     "lr_sh": _by_steps(1.25e-4, 0.41),
-    "lr_features": Default(_features_rate, f"steps that teach features: {TRAVEL:g} over them, at most {FASTEST:g}"),
+    "lr_features": Default(
+        _features_rate, f"steps that teach features: {TRAVEL:g} over them, at most {FASTEST:g}"
+    ),
 }
 
 
@@ -129,7 +146,9 @@ WITHOUT: dict[str, dict[str, Any]] = {  # rows of Table 5 that the trainer sees 
 
 
 def resolved(train: TrainSection, evidence: Evidence) -> TrainSection:
-    """The section with every setting that it leaves open decided, and those of the printed method as it has them."""
+    """The section with every setting that it leaves open decided, and those of the printed method
+    as it has them.
+    """
     if train.method == "printed":
         train = train.model_copy(update=PRINTED | WITHOUT.get(train.without, {}))
     for name, default in DEFAULTS.items():
@@ -138,9 +157,17 @@ def resolved(train: TrainSection, evidence: Evidence) -> TrainSection:
     return train
 
 
-def decided(train: TrainSection, done: TrainSection, with_features: bool) -> dict[str, dict[str, Any]]:
-    """Value and evidence, by name, of each setting that `train` leaves open and the training uses."""
-    unused = set() if with_features else {"feature_every", "feature_start", "feature_loss", "lr_features"}
+def decided(
+    train: TrainSection, done: TrainSection, with_features: bool
+) -> dict[str, dict[str, Any]]:
+    """Value and evidence, by name, of each setting that `train` leaves open and the training
+    uses.
+    """
+    unused = (
+        set()
+        if with_features
+        else {"feature_every", "feature_start", "feature_loss", "lr_features"}
+    )
     unused |= {"opacity"} if train.start else set()
     names = [name for name in DEFAULTS if getattr(train, name) in OPEN and name not in unused]
     printed = PRINTED if train.method == "printed" else {}
@@ -148,19 +175,27 @@ def decided(train: TrainSection, done: TrainSection, with_features: bool) -> dic
     return {name: {"value": getattr(done, name), "by": by[name]} for name in names}
 
 
-def evidence_of(train: TrainSection, capture: Capture, points: Points, features: Features | None) -> Evidence:
-    """Evidence for the open settings, but for the photos' exposures; only what they ask for is measured.
+def evidence_of(
+    train: TrainSection, capture: Capture, points: Points, features: Features | None
+) -> Evidence:
+    """Evidence for the open settings, but for the photos' exposures; only what they ask for is
+    measured.
 
-    Raises: ConfigError where the teacher has not what `train.feature_loss` asks for, InputError if capture and points
-      do not belong together, DataFailure without a training view.
+    Raises: ConfigError where the teacher has not what `train.feature_loss` asks for, InputError if
+      capture and points do not belong together, DataFailure without a training view.
     """
     n_views = len(training_rows(capture, points))
     labels = None if features is None else "none"
-    if features is not None and features.pseudo_labels is not None and features.confidence is not None:
+    if (
+        features is not None
+        and features.pseudo_labels is not None
+        and features.confidence is not None
+    ):
         labels = "given" if features.convention.get("kind") == "given" else "taught"
     if train.feature_loss == "cross-entropy" and labels == "none":
         raise ConfigError(
-            "train.feature_loss is cross-entropy, but the teacher brings no labels with a confidence; use length"
+            "train.feature_loss is cross-entropy, but the teacher brings no labels with a "
+            "confidence; use length"
         )
     return Evidence(
         n_views=n_views,
@@ -174,9 +209,9 @@ def evidence_of(train: TrainSection, capture: Capture, points: Points, features:
 def _why_no_depth(capture: Capture, points: Points) -> str:
     """Reason for not relying on measured depth ("": it is relied on).
 
-    Choices: not if the capture has no poses, since its unit is not the scene's then, nor if its views contradict one
-      another, as a sensor's do: its noise and its place beside the colour camera would be taught. Swept depth is only
-      where views agree.
+    Choices: not if the capture has no poses, since its unit is not the scene's then, nor if its
+      views contradict one another, as a sensor's do: its noise and its place beside the colour
+      camera would be taught. Swept depth is only where views agree.
     """
     if capture.depth is None and points.depths is not None:
         return ""
@@ -185,4 +220,7 @@ def _why_no_depth(capture: Capture, points: Points) -> str:
     apart = disagreement(capture, points)
     if apart <= MOST_APART:
         return ""
-    return f"depths of the same points differ by {apart:.1%} between views; train.weight_depth asks for it"
+    return (
+        f"depths of the same points differ by {apart:.1%} between views; train.weight_depth "
+        "asks for it"
+    )

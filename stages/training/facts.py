@@ -19,7 +19,9 @@ FEW = 20  # a class of fewer Gaussians has no mean worth comparing
 def facts_of(
     job: Job, trainer: Trainer, parameters: dict[str, np.ndarray], features: Features | None
 ) -> dict[str, Any]:
-    """Facts of a finished training with these final parameters: what semantics changed, seconds, memory."""
+    """Facts of a finished training with these final parameters: what semantics changed, seconds,
+    memory.
+    """
     facts: dict[str, Any] = {}
     if features is not None:
         mask = trainer.final_mask()
@@ -30,15 +32,19 @@ def facts_of(
     facts["seconds_per_step"] = trainer.seconds / timed
     if job.device == "cuda":
         facts["peak_device_bytes"] = torch.cuda.max_memory_allocated()
-    facts["milliseconds"] = {part: 1e3 * seconds / timed for part, seconds in trainer.laps.seconds.items()}
+    facts["milliseconds"] = {
+        part: 1e3 * seconds / timed for part, seconds in trainer.laps.seconds.items()
+    }
     return facts
 
 
 def printed_facts(model: PrintedScene, features: Features) -> dict[str, Any]:
     """Facts of a printed training: histograms of gates and masks, and what encodings alone know.
 
-    `agreement`: share of Gaussians whose label by shape features equals that by their own; `commonest`: share with the
-    commonest label, which an encoder that knows nothing reaches; `ranks_before`: of the bases of the scenes before.
+    `agreement`: share of Gaussians whose label by shape features equals that by their own;
+      `commonest`: share with the
+    commonest label, which an encoder that knows nothing reaches; `ranks_before`: of the bases of
+    the scenes before.
     """
     whole = model.whole()
     named, wanted = (
@@ -55,15 +61,21 @@ def guidance(
 ) -> dict[str, float | None]:
     """What semantics changed: which Gaussians and SH bands go.
 
-    Args: parameters: of a finished training; mask [N]: m̂ of its Gaussians, None without pruning; embeddings [L, C].
-    Returns: `mask_spread` and `band_spread`, standard deviations over classes of the mean m̂ and of the mean share of SH
+    Args: parameters: of a finished training; mask [N]: m̂ of its Gaussians, None without pruning;
+      embeddings [L, C].
+    Returns: `mask_spread` and `band_spread`, standard deviations over classes of the mean m̂ and of
+      the mean share of SH
       coefficients kept. None: not there.
     """
     labels = decode_labels(parameters["features"], embeddings)
 
     def spread(values: np.ndarray) -> float:
         counts, sums = np.bincount(labels), np.bincount(labels, values)
-        return float((sums / np.maximum(counts, 1))[counts >= FEW].std()) if (counts >= FEW).any() else 0.0
+        return (
+            float((sums / np.maximum(counts, 1))[counts >= FEW].std())
+            if (counts >= FEW).any()
+            else 0.0
+        )
 
     kept = (parameters["degrees"].astype(np.float64) + 1) ** 2 / 16
     return {

@@ -1,4 +1,6 @@
-"""Features lifted to Gaussians: what the 2D teacher says of each, by one pass over the training views."""
+"""Features lifted to Gaussians: what the 2D teacher says of each, by one pass over the training
+views.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,8 @@ def lifted_from(
     progress: Progress,
     median_steps: int = MEDIAN_STEPS,
 ) -> lifted_format.Lifted:
-    """The features of Gaussians with these raw parameters, by the training views among these cameras.
+    """The features of Gaussians with these raw parameters, by the training views among these
+    cameras.
 
     Args: gate: `lift.gate`; median_steps: from the mean of the views on.
     Raises:  InputError if artifacts do not belong together, DataFailure if no view sees a Gaussian.
@@ -41,7 +44,8 @@ def lifted_from(
     observations = gathered(n, n_channels, (view for view, _ in rounds))
     if len(observations.views) == 0:
         raise DataFailure(
-            "no training view sees a Gaussian that the teacher has features for; check that splat and cameras are in "
+            "no training view sees a Gaussian that the teacher has features for; check that splat "
+            "and cameras are in "
             "the same frame"
         )
     found = estimate(observations, median_steps, LEAST_WEIGHT)
@@ -52,18 +56,29 @@ def lifted_from(
 
 
 def training_names(capture: Capture, cameras: Cameras, features: Features) -> list[str]:
-    """Names of the training views with a camera, in its order. Raises InputError where artifacts do not fit."""
+    """Names of the training views with a camera, in its order. Raises InputError where artifacts do
+    not fit.
+    """
     is_test = dict(zip(capture.names, capture.is_test.tolist(), strict=True))
     if unknown := [name for name in cameras.names if name not in is_test]:
-        raise InputError(f"the cameras have a view {unknown[0]} that the capture has not; pass artifacts of one scene")
+        raise InputError(
+            f"the cameras have a view {unknown[0]} that the capture has not; pass "
+            "artifacts of one scene"
+        )
     if capture.size != (cameras.width, cameras.height):
-        raise InputError("the cameras are of another size than the capture; pass artifacts of one scene")
+        raise InputError(
+            "the cameras are of another size than the capture; pass artifacts of one scene"
+        )
     names = [name for name in cameras.names if not is_test[name]]
     known = set(features.names)
     if absent := [name for name in names if name not in known]:
-        raise InputError(f"the features have no view {absent[0]}; run the teacher stage on this capture")
+        raise InputError(
+            f"the features have no view {absent[0]}; run the teacher stage on this capture"
+        )
     if not names:
-        raise DataFailure("no training view has a camera; lower ingest.test_every's share of test views")
+        raise DataFailure(
+            "no training view has a camera; lower ingest.test_every's share of test views"
+        )
     return names
 
 
@@ -83,7 +98,9 @@ def lifted_views(
     for name in names:
         values = features.features[taught[name]]
         mask = None if capture.loss_mask is None else capture.loss_mask[row[name]]
-        said, share = to_cells(values, counts_of(features, taught[name], values), capture.size, mask)
+        said, share = to_cells(
+            values, counts_of(features, taught[name], values), capture.size, mask
+        )
         camera = cameras.cam_from_world[place[name]], cameras.Ks[place[name]]
         yield lift(gaussians, *camera, capture.size, said, share, gate)
 
@@ -91,8 +108,8 @@ def lifted_views(
 def counts_of(features: Features, view: int, values: np.ndarray) -> np.ndarray:
     """What each entry of a view's features counts, f32 [h, w].
 
-    Choices: nothing where the teacher has no label; its confidence where the source brought the labels with one, as
-      the loss of a training has it; 1 elsewhere.
+    Choices: nothing where the teacher has no label; its confidence where the source brought the
+      labels with one, as the loss of a training has it; 1 elsewhere.
     """
     if features.pseudo_labels is None:
         return np.ones(values.shape[:2], np.float32)

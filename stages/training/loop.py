@@ -21,8 +21,8 @@ log = logging.getLogger("chebsplat")
 def follow(job: Job, trainer: Trainer) -> list[dict[str, float]]:
     """Run the steps, from the last save where there is one; returns the trace.
 
-    A row holds means of the losses since the row before; its seconds count training alone, not the held-in
-    measurements.
+    A row holds means of the losses since the row before; its seconds count training alone, not the
+    held-in measurements.
     """
     n_views = len(trainer.views.names)
     watched = list(range(0, n_views, max(n_views // 4, 1)))[:4]
@@ -35,8 +35,11 @@ def follow(job: Job, trainer: Trainer) -> list[dict[str, float]]:
         job.facts["resumed_at"] = [*held["resumed_at"], trainer.step]
         log.info("resumed at step %d", trainer.step)
     with deferred() as asked:
-        losses: deque[float | Tensor] = deque(maxlen=trainer.feature_every)  # the features' is in one step of so many
-        rounds = job.progress.track(trainer.steps(), lambda: expected(trainer), "train", start=trainer.step)
+        # the features' is in one step of so many
+        losses: deque[float | Tensor] = deque(maxlen=trainer.feature_every)
+        rounds = job.progress.track(
+            trainer.steps(), lambda: expected(trainer), "train", start=trainer.step
+        )
         for figures, status in rounds:
             since.append(figures)
             if trainer.step % train.report_every == 0 or trainer.share >= 1:
@@ -51,23 +54,40 @@ def follow(job: Job, trainer: Trainer) -> list[dict[str, float]]:
             if asked.stop is not None:
                 log.info("saved at step %d; the same command goes on from there", trainer.step)
                 break
-    columns = sorted({k for row in trace for k in row}, key=lambda k: (k != "step", k != "seconds", k))
+    columns = sorted(
+        {k for row in trace for k in row}, key=lambda k: (k != "step", k != "seconds", k)
+    )
     return [{k: row.get(k, 0.0) for k in columns} for row in trace]
 
 
-def measured(trainer: Trainer, since: list[dict[str, float | Tensor]], watched: list[int]) -> dict[str, float]:
-    """A row of the trace, from the figures of steps since the row before and the PSNR of the training views watched."""
-    row: dict[str, float | Tensor] = {"step": trainer.step, "seconds": trainer.seconds, "n": since[-1]["n"]}
+def measured(
+    trainer: Trainer, since: list[dict[str, float | Tensor]], watched: list[int]
+) -> dict[str, float]:
+    """A row of the trace, from the figures of steps since the row before and the PSNR of the
+    training views watched.
+    """
+    row: dict[str, float | Tensor] = {
+        "step": trainer.step,
+        "seconds": trainer.seconds,
+        "n": since[-1]["n"],
+    }
     for name in {name for entry in since for name in entry} - row.keys():
-        values = [entry[name] for entry in since if name in entry]  # the features' is in some steps only
+        # the features' is in some steps only
+        values = [entry[name] for entry in since if name in entry]
         row[name] = sum(values) / len(values)
     row |= {"psnr": trainer.held_in_psnr(watched), "sh_kept": trainer.model.sh_kept()}
     return {k: float(v) for k, v in row.items()}
 
 
 def shown(trace: list[dict[str, float]]) -> dict[str, str]:
-    """What the progress line says of the last measurement: on views that are trained on, not on test views."""
-    return {"train PSNR": f"{trace[-1]['psnr']:.2f}", "sh": f"{trace[-1]['sh_kept']:.0%}"} if trace else {}
+    """What the progress line says of the last measurement: on views that are trained on, not on
+    test views.
+    """
+    return (
+        {"train PSNR": f"{trace[-1]['psnr']:.2f}", "sh": f"{trace[-1]['sh_kept']:.0%}"}
+        if trace
+        else {}
+    )
 
 
 def expected(trainer: Trainer) -> int:
@@ -76,7 +96,10 @@ def expected(trainer: Trainer) -> int:
 
 
 def state(
-    trainer: Trainer, trace: list[dict[str, float]], since: list[dict[str, float | Tensor]], job: Job
+    trainer: Trainer,
+    trace: list[dict[str, float]],
+    since: list[dict[str, float | Tensor]],
+    job: Job,
 ) -> dict[str, Any]:
     """All that a resumed training goes on from."""
     resumed = job.facts.get("resumed_at", [])

@@ -13,18 +13,26 @@ from chebsplat.stages.training.views import training_rows
 
 
 def own_exposures(capture: Capture, points: Points) -> tuple[np.ndarray, dict[str, Any]]:
-    """Difference of each training photo's exposure [V, 3] from its neighbours', in stops; and the spread of `all` and
-    of these `own` parts, None where no exposure is known. A second or two.
+    """Difference of each training photo's exposure [V, 3] from its neighbours', in stops; and the
+    spread of `all` and of these `own` parts, None where no exposure is known. A second or two.
     """
     measured, poses = exposures_of(capture, points)
     known = measured[np.isfinite(measured).all(1)]
     own = own_part(measured, poses)
-    return own, {"all": float(known.std(0).mean()) if len(known) else None, "own": float(own.std(0).mean())}
+    return own, {
+        "all": float(known.std(0).mean()) if len(known) else None,
+        "own": float(own.std(0).mean()),
+    }
 
 
 def exposures_of(capture: Capture, points: Points) -> tuple[np.ndarray, np.ndarray]:
-    """Exposures of the training views in stops, by the points' tracks where they have any; and these views' poses."""
-    row, used = {name: view for view, name in enumerate(capture.names)}, training_rows(capture, points)
+    """Exposures of the training views in stops, by the points' tracks where they have any; and
+    these views' poses.
+    """
+    row, used = (
+        {name: view for view, name in enumerate(capture.names)},
+        training_rows(capture, points),
+    )
     tracks = None
     if len(points.tracks):
         column = np.full(len(points.names), -1)

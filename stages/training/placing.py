@@ -1,7 +1,9 @@
-"""A splat from elsewhere, brought into the frame of a capture: it may lie there already, a file beside it may tell the
-way, or it was trained in one of the frames that trainers make of the cameras they are given.
+"""A splat from elsewhere, brought into the frame of a capture: it may lie there already, a file
+beside it may tell the way, or it was trained in one of the frames that trainers make of the cameras
+they are given.
 
-What is right is told by pictures: renders of some training views resemble their own photos more than others'.
+What is right is told by pictures: renders of some training views resemble their own photos more
+  than others'.
 """
 
 from __future__ import annotations
@@ -35,11 +37,13 @@ N_VIEWS, LEAST_VIEWS, WIDTH = 8, 4, 96  # that are compared, without which nothi
 # have 0.64 to 0.82; turned by a right angle or shifted by a third of the room, at most 0.31. Few or
 # faint Gaussians have 0.1 to 0.66 at their places.
 AGREES, DOUBTED = 0.4, 0.2
-SAME = 0.01  # by which a frame that points refine must be better than the usual ones, which are exact
+# by which a frame that points refine must be better than the usual ones, which are exact
+SAME = 0.01
 ONE_COLOR = 1 / 72  # of the coefficient of band 0, which is a step of 255 in colour
 BETTER = 0.1  # by which another frame must be better than the splat's own
 FIRST, REFINED = 4, 3  # views that all frames are tried on; frames of these that are refined
-STEPS, N_POINTS, NEAREST = 100, 1000, 0.6  # of refining: steps at most, points, and which of them are believed
+# of refining: steps at most, points, and which of them are believed
+STEPS, N_POINTS, NEAREST = 100, 1000, 0.6
 FEW_STEPS, FEW_POINTS = 20, 300  # of a rough one, by which starts are chosen
 LEAST_GAIN = 1e-3  # of their distances, by which a step must bring them nearer
 SWAPPED = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # nerfstudio's axes of COLMAP's: z up
@@ -47,7 +51,9 @@ TURNS = [np.diag(signs) for signs in ((1.0, 1, 1), (1.0, -1, -1), (-1.0, 1, -1),
 
 
 class Sights(NamedTuple):
-    """V training views: photos u8 [V, h, w, 3], reduced, and their cameras, Ks [V, 3, 3] and poses [V, 4, 4]."""
+    """V training views: photos u8 [V, h, w, 3], reduced, and their cameras, Ks [V, 3, 3] and poses
+    [V, 4, 4].
+    """
 
     photos: np.ndarray
     Ks: np.ndarray
@@ -62,14 +68,21 @@ def in_frame(
     points: np.ndarray | None,
     theirs: dict[str, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Raw parameters of a splat in the frame of the cameras; bit for bit as they are where the splat lies in it.
+    """Raw parameters of a splat in the frame of the cameras; bit for bit as they are where the
+    splat lies in it.
 
-    Args: ply: where it comes from, for messages and the file beside it; parameters: brought from the source's world to
-          the capture's, and theirs: as the file has them, None: the same; cameras: of the capture, by name;
-          points: [P, 3] of the surface in the cameras' frame, which normalisations are computed of and made exact by.
-    Raises:  InputError naming the splat, and what was tried, where it resembles the photos in no frame.
-    Choices: it is turned only where that is clearly better. One that resembles them little in its own frame, and in no
-      other, is taken with a warning: it may be trained little. With fewer than LEAST_VIEWS, and of Gaussians of one
+    Args: ply: where it comes from, for messages and the file beside it; parameters: brought from
+      the source's world to
+          the capture's, and theirs: as the file has them, None: the same; cameras: of the capture,
+          by name;
+          points: [P, 3] of the surface in the cameras' frame, which normalisations are computed of
+            and made exact by.
+    Raises:  InputError naming the splat, and what was tried, where it resembles the photos in no
+      frame.
+    Choices: it is turned only where that is clearly better. One that resembles them little in its
+      own frame, and in no
+      other, is taken with a warning: it may be trained little. With fewer than LEAST_VIEWS, and of
+        Gaussians of one
       colour, nothing is said.
     """
     sights, light = sights_of(capture, cameras), parameters["sh0"][:, 0]
@@ -83,22 +96,29 @@ def in_frame(
     ways = [(name, way.after(outward)) for name, way in told(ply)]
     tried = [(name, way) for name, way in ways if likeness(renderer, sights, way) >= AGREES]
     tried = tried or guessed(renderer, sights, theirs, cameras, points)
-    found, name, way = max(((likeness(renderer, sights, way), name, way) for name, way in tried), key=lambda x: x[0])
+    found, name, way = max(
+        ((likeness(renderer, sights, way), name, way) for name, way in tried), key=lambda x: x[0]
+    )
     if found >= max(AGREES, own + BETTER):
         log.warning(
-            "%s lies in another frame than the cameras, that of %s: it is scaled by %.4g, turned and shifted "
+            "%s lies in another frame than the cameras, that of %s: it is scaled by %.4g, turned "
+            "and shifted "
             "(its renders resemble the photos by %.2f of 1 then, %.2f as it is)", ply, name, 1 / way.scale, found, own,
         )  # fmt: skip
         return way.inverse().of_gaussians(theirs)
     if own < DOUBTED:
         file = beside(ply)
         raise InputError(
-            f"{ply} lies in another frame than the cameras: its renders resemble the photos by {own:.2f} of 1, and by "
-            f"{found:.2f} at most by {f'{file}, ' if file else ''}nerfstudio's and gsplat's normalisations and by "
-            f"their points; put the training's {NAME} beside it, or train and export it without normalising the scene"
+            f"{ply} lies in another frame than the cameras: its renders resemble the photos by "
+            f"{own:.2f} of 1, and by "
+            f"{found:.2f} at most by {f'{file}, ' if file else ''}nerfstudio's and gsplat's "
+            "normalisations and by "
+            f"their points; put the training's {NAME} beside it, or train and export it without "
+            "normalising the scene"
         )
     log.warning(
-        "%s resembles the photos by %.2f of 1 only: it is trained little, or lies in another frame than the cameras",
+        "%s resembles the photos by %.2f of 1 only: it is trained little, or lies in another "
+        "frame than the cameras",
         ply, own,
     )  # fmt: skip
     return parameters
@@ -107,28 +127,41 @@ def in_frame(
 def sights_of(capture: Capture, cameras: Cameras) -> Sights | None:
     """Training views that are spread evenly over all; None of too few."""
     row = {name: k for k, name in enumerate(capture.names)}
-    used = [k for k, name in enumerate(cameras.names) if name in row and not capture.is_test[row[name]]]
+    used = [
+        k for k, name in enumerate(cameras.names) if name in row and not capture.is_test[row[name]]
+    ]
     if len(used) < LEAST_VIEWS:
         return None
     chosen = np.unique(np.linspace(0, len(used) - 1, N_VIEWS).round().astype(int))
     kept = np.array(used)[chosen]
     width = min(cameras.width, WIDTH)
     size = (width, max(round(cameras.height * width / cameras.width), 1))
-    photos = [Image.fromarray(capture.images[row[cameras.names[k]]]).resize(size, Image.Resampling.BOX) for k in kept]
+    photos = [
+        Image.fromarray(capture.images[row[cameras.names[k]]]).resize(size, Image.Resampling.BOX)
+        for k in kept
+    ]
     Ks = resized(cameras.Ks[kept], size[0] / cameras.width, size[1] / cameras.height)
-    return Sights(np.stack([np.asarray(photo) for photo in photos]), Ks, cameras.cam_from_world[kept])
+    return Sights(
+        np.stack([np.asarray(photo) for photo in photos]), Ks, cameras.cam_from_world[kept]
+    )
 
 
 def plain(parameters: dict[str, np.ndarray]) -> SceneRenderer:
     """A renderer of the colours that are the same from everywhere, which need not be turned."""
     names = ("means", "log_scales", "quats", "logit_opacities", "sh0")
     n = len(parameters["means"])
-    none: dict[str, np.ndarray] = {"shN": np.zeros((n, 0, 3), np.float32), "degrees": np.zeros(n, np.uint8)}
+    none: dict[str, np.ndarray] = {
+        "shN": np.zeros((n, 0, 3), np.float32),
+        "degrees": np.zeros(n, np.uint8),
+    }
     return SceneRenderer({name: parameters[name] for name in names} | none)
 
 
-def likeness(renderer: SceneRenderer, sights: Sights, way: Similarity, n_views: int = N_VIEWS) -> float:
-    """How much more the renders of a splat resemble their own photos than those of other views: the difference of mean
+def likeness(
+    renderer: SceneRenderer, sights: Sights, way: Similarity, n_views: int = N_VIEWS
+) -> float:
+    """How much more the renders of a splat resemble their own photos than those of other views: the
+    difference of mean
     correlations of pixels. `way`: from the cameras' frame into the splat's.
     """
     rows = np.unique(np.linspace(0, len(sights.photos) - 1, n_views).round().astype(int))
@@ -151,7 +184,9 @@ def unit_rows(images: np.ndarray) -> np.ndarray:
 
 
 def told(ply: Path) -> Iterator[tuple[str, Similarity]]:
-    """The way of the file beside a splat: of the cameras as they are, and where either side swapped axes before."""
+    """The way of the file beside a splat: of the cameras as they are, and where either side swapped
+    axes before.
+    """
     if (path := beside(ply)) is not None:
         scale, rotation, shift = read_dataparser(path)
         way = Similarity(scale, rotation, scale * shift)
@@ -166,7 +201,9 @@ def guessed(
     cameras: Cameras,
     points: np.ndarray | None,
 ) -> list[tuple[str, Similarity]]:
-    """The likeliest of the frames that trainers make, and where there are points these frames refined by them."""
+    """The likeliest of the frames that trainers make, and where there are points these frames
+    refined by them.
+    """
     tried = [*nerfstudios(cameras.cam_from_world), *gsplats(cameras.cam_from_world, points)]
     first = np.array([likeness(renderer, sights, way, FIRST) for _, way in tried])
     kept = [tried[k] for k in np.argsort(-first)[:REFINED]]
@@ -177,7 +214,8 @@ def guessed(
         return kept
     tree = KDTree(solid)
     rough = sorted(
-        (refined(points, tree, way, FEW_STEPS, FEW_POINTS) for way in principal(points, solid)), key=lambda x: x[1]
+        (refined(points, tree, way, FEW_STEPS, FEW_POINTS) for way in principal(points, solid)),
+        key=lambda x: x[1],
     )
     kept += [("its points", way) for way, _ in rough[:REFINED]]
     finer = [(f"{name}, refined", refined(points, tree, way)[0]) for name, way in kept]
@@ -186,8 +224,8 @@ def guessed(
 
 
 def nerfstudios(cam_from_world: np.ndarray) -> Iterator[tuple[str, Similarity]]:
-    """nerfstudio's frames: cameras turned upright or to their principal axes, about their mean, and scaled so that the
-    farthest coordinate is 1; of COLMAP's axes and of its own.
+    """nerfstudio's frames: cameras turned upright or to their principal axes, about their mean, and
+    scaled so that the farthest coordinate is 1; of COLMAP's axes and of its own.
     """
     for prior in (np.eye(3), SWAPPED):
         eyes = centers(cam_from_world) @ prior.T
@@ -195,11 +233,18 @@ def nerfstudios(cam_from_world: np.ndarray) -> Iterator[tuple[str, Similarity]]:
         for middle in (eyes.mean(0), np.zeros(3)):
             for name, turn in uprights(eyes - eyes.mean(0), rights, ups):
                 scale = 1 / max(float(np.abs((eyes - middle) @ turn.T).max()), 1e-30)
-                yield f"nerfstudio's orientation {name}", Similarity(scale, turn @ prior, -scale * turn @ middle)
+                yield (
+                    f"nerfstudio's orientation {name}",
+                    Similarity(scale, turn @ prior, -scale * turn @ middle),
+                )
 
 
-def uprights(spread: np.ndarray, rights: np.ndarray, ups: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """nerfstudio's rotations of cameras: of centres about their mean, x axes and what is up to them, each [V, 3]."""
+def uprights(
+    spread: np.ndarray, rights: np.ndarray, ups: np.ndarray
+) -> Iterator[tuple[str, np.ndarray]]:
+    """nerfstudio's rotations of cameras: of centres about their mean, x axes and what is up to
+    them, each [V, 3].
+    """
     up = ups.mean(0) / max(float(np.linalg.norm(ups.mean(0))), 1e-30)
     yield "up", onto(up, np.array([0, 0, 1.0]))
     level = np.linalg.svd(rights, full_matrices=False)[2][-1]
@@ -213,7 +258,9 @@ def uprights(spread: np.ndarray, rights: np.ndarray, ups: np.ndarray) -> Iterato
 
 
 def onto(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """The least rotation [3, 3] that turns a unit vector into another; about x where they are opposite."""
+    """The least rotation [3, 3] that turns a unit vector into another; about x where they are
+    opposite.
+    """
     axis, cosine = np.cross(one, other), float(one @ other)
     if cosine < -1 + 1e-8:
         return np.diag([1.0, -1, -1])
@@ -221,9 +268,11 @@ def onto(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.asarray(np.eye(3) + cross + cross @ cross / (1 + cosine))
 
 
-def gsplats(cam_from_world: np.ndarray, points: np.ndarray | None) -> Iterator[tuple[str, Similarity]]:
-    """gsplat's frames: what is up turned into -y, the middle of what cameras look at, or of them, at 0, their median
-    distance 1; then points to their principal axes.
+def gsplats(
+    cam_from_world: np.ndarray, points: np.ndarray | None
+) -> Iterator[tuple[str, Similarity]]:
+    """gsplat's frames: what is up turned into -y, the middle of what cameras look at, or of them,
+    at 0, their median distance 1; then points to their principal axes.
     """
     ups = -cam_from_world[:, 1, :3].mean(0)
     turn = onto(ups / max(float(np.linalg.norm(ups)), 1e-30), np.array([0, -1.0, 0]))
@@ -237,11 +286,16 @@ def gsplats(cam_from_world: np.ndarray, points: np.ndarray | None) -> Iterator[t
             center, frame, _ = principal_axes(first.of_points(points))
             for signs in TURNS:
                 rotation = signs @ frame
-                yield "gsplat's normalisation", Similarity(1.0, rotation, -rotation @ center).after(first)
+                yield (
+                    "gsplat's normalisation",
+                    Similarity(1.0, rotation, -rotation @ center).after(first),
+                )
 
 
 def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """The median of points, their principal axes as the rows of a rotation, longest first, and the median distance."""
+    """The median of points, their principal axes as the rows of a rotation, longest first, and the
+    median distance.
+    """
     center = np.median(points, axis=0)
     axes = np.linalg.eigh(np.cov(points, rowvar=False))[1][:, ::-1].T
     axes[0] *= np.sign(np.linalg.det(axes))
@@ -249,7 +303,8 @@ def principal_axes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
 
 
 def principal(points: np.ndarray, others: np.ndarray) -> Iterator[Similarity]:
-    """Ways that lay the middle, the principal axes and the size of points on those of others, in each of their 24
+    """Ways that lay the middle, the principal axes and the size of points on those of others, in
+    each of their 24
     orders: axes of like length may be another's.
     """
     center, axes, size = principal_axes(points)
@@ -262,12 +317,15 @@ def principal(points: np.ndarray, others: np.ndarray) -> Iterator[Similarity]:
 def refined(
     points: np.ndarray, tree: KDTree, way: Similarity, steps: int = STEPS, n_points: int = N_POINTS
 ) -> tuple[Similarity, float]:
-    """A way that brings points [P, 3] nearer to what the tree holds, by pairs of the nearest, and how far they are
-    then, of the way's scale.
+    """A way that brings points [P, 3] nearer to what the tree holds, by pairs of the nearest, and
+    how far they are then, of the way's scale.
 
-    Choices: the NEAREST of them in each step: of the others the splat has nothing, or floats instead.
+    Choices: the NEAREST of them in each step: of the others the splat has nothing, or floats
+      instead.
     """
-    chosen = points[np.random.default_rng(0).choice(len(points), min(len(points), n_points), replace=False)]
+    chosen = points[
+        np.random.default_rng(0).choice(len(points), min(len(points), n_points), replace=False)
+    ]
     last = np.inf
     for _ in range(steps):
         away, index = tree.query(way.of_points(chosen))

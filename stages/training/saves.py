@@ -21,8 +21,8 @@ LAYOUT = 3  # of a state: one of another layout is not gone on from
 class Saves:
     """States of one training, the last one kept, in the job's scratch folder.
 
-    A state fits only the same settings, inputs, package versions, device and number of threads: from another one the
-    training starts anew and says so.
+    A state fits only the same settings, inputs, package versions, device and number of threads:
+    from another one the training starts anew and says so.
     """
 
     def __init__(self, job: Job):
@@ -58,7 +58,9 @@ class Saves:
         return dict(held["state"])
 
     def offer(self, state: Any, now: bool = False) -> None:
-        """Save what `state()` returns if the last save is long ago, or `now`: whole or not at all."""
+        """Save what `state()` returns if the last save is long ago, or `now`: whole or not at
+        all.
+        """
         if not now and time.monotonic() - self.saved < SECONDS:
             return
 

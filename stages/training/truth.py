@@ -1,4 +1,6 @@
-"""How far the labels that a source brings are met on training views, by a teacher and by Gaussians."""
+"""How far the labels that a source brings are met on training views, by a teacher and by
+Gaussians.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +22,11 @@ def labels_right(
     capture: Capture, parameters: dict[str, np.ndarray], features: np.ndarray, teacher: Features
 ) -> float | None:
     """Share of some pixels of training views that the Gaussian nearest to their surface gives the
-    true label; None where the capture has no labels with depth and poses. No test view is looked at.
+    true label; None where the capture has no labels with depth and poses. No test view is looked
+    at.
 
-    Args: parameters: raw, of N Gaussians; features [N, C]; teacher: whose labels they are decoded to.
+    Args: parameters: raw, of N Gaussians; features [N, C]; teacher: whose labels they are decoded
+      to.
     Choices: Gaussians that are half transparent are no surface. Pixels of classes that are none of
       the teacher's labels are not asked.
     """
@@ -30,7 +34,9 @@ def labels_right(
         return None
     rng, training = np.random.default_rng(SEED), np.flatnonzero(~capture.is_test)
     points, truth = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
-    for view in training[np.linspace(0, len(training) - 1, min(N_VIEWS, len(training))).astype(int)]:
+    for view in training[
+        np.linspace(0, len(training) - 1, min(N_VIEWS, len(training))).astype(int)
+    ]:
         depth, labels = capture.depth[view], true_labels(capture, view, teacher.label_names)
         usable = (depth > 0) & (labels >= 0)
         if capture.loss_mask is not None:
@@ -48,8 +54,8 @@ def labels_right(
 
 
 def pixels_right(capture: Capture, teacher: Features) -> float | None:
-    """Share of the pixels of training views that a teacher's pseudo labels name rightly, where -1 is
-    as wrong as any other; None where the capture has no labels.
+    """Share of the pixels of training views that a teacher's pseudo labels name rightly, where -1
+    is as wrong as any other; None where the capture has no labels.
     """
     if capture.labels is None or teacher.pseudo_labels is None:
         return None

@@ -1,4 +1,6 @@
-"""The training views of a scene, joined by name from its artifacts: photos, masks, features, labels and depth."""
+"""The training views of a scene, joined by name from its artifacts: photos, masks, features, labels
+and depth.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,10 @@ from chebsplat.formats.points import Points
 from chebsplat.photos.exposures import relit
 from chebsplat.views import TaughtLabels, Views, remembered, stacked
 
-FEATURE_BYTES = 64 << 20  # of features that are kept in memory; what is beyond is read when its view is looked at
-PHOTO_BYTES, MASK_BYTES, DEPTH_BYTES = 2 << 30, 512 << 20, 512 << 20  # of photos, masks and depth likewise
+# of features that are kept in memory; what is beyond is read when its view is looked at
+FEATURE_BYTES = 64 << 20
+# of photos, masks and depth likewise
+PHOTO_BYTES, MASK_BYTES, DEPTH_BYTES = 2 << 30, 512 << 20, 512 << 20
 N_PAIRS, N_PIXELS = 100, 1000  # views whose depths are compared, and pixels of each
 SAME = 0.1  # of its depth, beyond which what one view sees is hidden from the other
 
@@ -29,7 +33,10 @@ def training_rows(capture: Capture, points: Points) -> list[int]:
     """
     is_test = dict(zip(capture.names, capture.is_test.tolist(), strict=True))
     if unknown := [name for name in points.names if name not in is_test]:
-        raise InputError(f"the points know a view {unknown[0]} that the capture does not; pass artifacts of one scene")
+        raise InputError(
+            f"the points know a view {unknown[0]} that the capture does not; pass "
+            "artifacts of one scene"
+        )
     used = [k for k, name in enumerate(points.names) if not is_test[name]]
     if not used:
         raise DataFailure("no training view is registered")
@@ -43,12 +50,15 @@ def training_views(
     with_depth: bool = False,
     exposures: np.ndarray | None = None,
 ) -> Views:
-    """The registered training views, joined by name, with their depth where asked for, and without these exposures
-    [V, 3], in stops.
+    """The registered training views, joined by name, with their depth where asked for, and without
+    these exposures [V, 3], in stops.
 
     Raises: InputError if artifacts do not belong together, DataFailure without a training view.
     """
-    row, used = {name: view for view, name in enumerate(capture.names)}, training_rows(capture, points)
+    row, used = (
+        {name: view for view, name in enumerate(capture.names)},
+        training_rows(capture, points),
+    )
     names = [points.names[k] for k in used]
     images, masks = capture.images, capture.loss_mask
     chosen = [row[name] for name in names]
@@ -57,9 +67,13 @@ def training_views(
         source = {name: view for view, name in enumerate(features.names)}
         absent = [name for name in names if name not in source]
         if absent:
-            raise InputError(f"the features have no view {absent[0]}; run the teacher stage on this capture")
+            raise InputError(
+                f"the features have no view {absent[0]}; run the teacher stage on this capture"
+            )
         stored = features.features
-        read = remembered(lambda index: torch.from_numpy(stored[source[names[index]]]), FEATURE_BYTES)
+        read = remembered(
+            lambda index: torch.from_numpy(stored[source[names[index]]]), FEATURE_BYTES
+        )
 
         def of(index: int) -> torch.Tensor:
             return read(index).float()
@@ -77,7 +91,9 @@ def training_views(
         stacked(photo, len(chosen), PHOTO_BYTES),
         torch.from_numpy(points.Ks[used]).float(),
         torch.from_numpy(points.cam_from_world[used]).float(),
-        None if masks is None else stacked(lambda k: torch.from_numpy(masks[chosen[k]]), len(chosen), MASK_BYTES),
+        None
+        if masks is None
+        else stacked(lambda k: torch.from_numpy(masks[chosen[k]]), len(chosen), MASK_BYTES),
         of,
         labels_of,
         depth_of,
@@ -85,13 +101,21 @@ def training_views(
 
 
 def taught_labels(features: Features, rows: list[int]) -> Callable[[int], TaughtLabels]:
-    """The labels of the training views, whose rows in the features these are; FEATURE_BYTES of a kind are kept."""
-    labels, confidence, codes = features.pseudo_labels, features.confidence, torch.from_numpy(features.label_embeddings)
+    """The labels of the training views, whose rows in the features these are; FEATURE_BYTES of a
+    kind are kept.
+    """
+    labels, confidence, codes = (
+        features.pseudo_labels,
+        features.confidence,
+        torch.from_numpy(features.label_embeddings),
+    )
     assert labels is not None
     assert confidence is not None
 
     classes = remembered(lambda index: torch.from_numpy(labels[rows[index]]).long(), FEATURE_BYTES)
-    certainty = remembered(lambda index: torch.from_numpy(confidence[rows[index]]).float(), FEATURE_BYTES)
+    certainty = remembered(
+        lambda index: torch.from_numpy(confidence[rows[index]]).float(), FEATURE_BYTES
+    )
 
     def of(index: int) -> TaughtLabels:
         found = classes(index)
@@ -100,28 +124,38 @@ def taught_labels(features: Features, rows: list[int]) -> Callable[[int], Taught
     return of
 
 
-def measured_depth(capture: Capture, points: Points, used: list[int]) -> Callable[[int, int], Tensor]:
-    """z-depth, every so many pixels, of the views of the points that have these indices: the capture's, otherwise what
-    was swept, 0 where neither tells.
+def measured_depth(
+    capture: Capture, points: Points, used: list[int]
+) -> Callable[[int, int], Tensor]:
+    """z-depth, every so many pixels, of the views of the points that have these indices: the
+    capture's, otherwise what was swept, 0 where neither tells.
 
-    Raises: ConfigError where there is none, or where its unit is not the scene's, as poses are not the capture's own.
+    Raises: ConfigError where there is none, or where its unit is not the scene's, as poses are not
+      the capture's own.
     """
     depth, swept, (width, height) = capture.depth, points.depths, capture.size
     if depth is not None and capture.cam_from_world is not None:
         row = {name: view for view, name in enumerate(capture.names)}
-        read = remembered(lambda index: torch.from_numpy(depth[row[points.names[used[index]]]]), DEPTH_BYTES)
+        read = remembered(
+            lambda index: torch.from_numpy(depth[row[points.names[used[index]]]]), DEPTH_BYTES
+        )
     elif swept is not None:
         factor = width // swept.shape[2]  # of the blocks of pixels that a swept one stands for
 
         def read(index: int) -> Tensor:
-            blocks = torch.from_numpy(swept[used[index]]).repeat_interleave(factor, 0).repeat_interleave(factor, 1)
+            blocks = (
+                torch.from_numpy(swept[used[index]])
+                .repeat_interleave(factor, 0)
+                .repeat_interleave(factor, 1)
+            )
             whole = torch.zeros(height, width)
             whole[: len(blocks), : blocks.shape[1]] = blocks
             return whole
 
     else:
         raise ConfigError(
-            "train.weight_depth needs a capture with poses and depth, and this one has no depth; set it to 0, or sweep "
+            "train.weight_depth needs a capture with poses and depth, and this one has no depth; "
+            "set it to 0, or sweep "
             "the photos for it (sfm.dense=on)"
         )
 
@@ -133,8 +167,8 @@ def measured_depth(capture: Capture, points: Points, used: list[int]) -> Callabl
 
 
 def disagreement(capture: Capture, points: Points) -> float:
-    """Median over points of |z' / z - 1|, z' from one training view's depth and z what another sees there; 0 if no two
-    views see a point in common, or there are none.
+    """Median over points of |z' / z - 1|, z' from one training view's depth and z what another sees
+    there; 0 if no two views see a point in common, or there are none.
     """
     assert capture.depth is not None
     row, rng = {name: view for view, name in enumerate(capture.names)}, np.random.default_rng(0)
@@ -145,7 +179,9 @@ def disagreement(capture: Capture, points: Points) -> float:
         pixels = np.stack([rng.integers(0, side, N_PIXELS) for side in one.shape], 1)
         pixels = pixels[one[pixels[:, 0], pixels[:, 1]] > 0]  # nan is none
         world = unproject(one, points.Ks[a], points.cam_from_world[a], pixels)
-        seen = (world @ points.cam_from_world[b, :3, :3].T + points.cam_from_world[b, :3, 3]) @ points.Ks[b].T
+        seen = (
+            world @ points.cam_from_world[b, :3, :3].T + points.cam_from_world[b, :3, 3]
+        ) @ points.Ks[b].T
         seen = seen[seen[:, 2] > 0]
         column, line = (np.floor(seen[:, axis] / seen[:, 2]) for axis in (0, 1))
         inside = (column >= 0) & (column < other.shape[1]) & (line >= 0) & (line < other.shape[0])

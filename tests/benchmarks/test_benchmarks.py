@@ -1,4 +1,6 @@
-"""`python -m benchmarks` lists what there is, and brings the scene that a benchmark measures on up to date first."""
+"""`python -m benchmarks` lists what there is, and brings the scene that a benchmark measures on up
+to date first.
+"""
 
 import ast
 import csv
@@ -17,7 +19,11 @@ from chebsplat.stages.registry import STAGES
 def test_every_benchmark_has_a_main_and_needs_stages_that_exist():
     for benchmark in bench.BENCHMARKS.values():
         file = ROOT / "benchmarks" / (benchmark.module.replace(".", "/") + ".py")
-        functions = {node.name: node for node in ast.parse(file.read_text()).body if isinstance(node, ast.FunctionDef)}
+        functions = {
+            node.name: node
+            for node in ast.parse(file.read_text()).body
+            if isinstance(node, ast.FunctionDef)
+        }
         assert [a.arg for a in functions["main"].args.args] == ["arguments"], file
         assert set(benchmark.stages) <= set(STAGES)
 
@@ -84,14 +90,18 @@ def test_make_runs_one_by_name(words):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:CUDA is not available, disabling CUDA profiling")
-def test_what_awaits_a_gpu_runs_to_its_end_where_the_cpu_stands_in(up_to_teacher, tmp_path, monkeypatch):
+def test_what_awaits_a_gpu_runs_to_its_end_where_the_cpu_stands_in(
+    up_to_teacher, tmp_path, monkeypatch
+):
     import torch
 
     from benchmarks.training import gpu
     from chebsplat.rasterize import rasterize
 
     def rasterization(means, quats, scales, opacities, colors, *camera, packed, sh_degree=None):
-        return rasterize(means, quats, scales, opacities, colors if sh_degree is None else colors[:, 0], *camera)
+        return rasterize(
+            means, quats, scales, opacities, colors if sh_degree is None else colors[:, 0], *camera
+        )
 
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=rasterization))
     for name, answer in (("get_device_name", "none"), ("max_memory_allocated", 0)):

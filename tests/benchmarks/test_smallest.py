@@ -1,4 +1,6 @@
-"""Every benchmark runs to its end at its smallest size, and ends with 1 where a bar of it is missed."""
+"""Every benchmark runs to its end at its smallest size, and ends with 1 where a bar of it is
+missed.
+"""
 
 import importlib.util
 import subprocess
@@ -36,11 +38,22 @@ BY_ITSELF = {"gpu"}  # test_what_awaits_a_gpu_runs_to_its_end_where_the_cpu_stan
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory):
-    """The links of a toy scene that is finished with all that a benchmark reads; CHEBSPLAT_WORK is theirs."""
+    """The links of a toy scene that is finished with all that a benchmark reads; CHEBSPLAT_WORK is
+    theirs.
+    """
     store = tmp_path_factory.mktemp("work")
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("CHEBSPLAT_WORK", str(store))
-        command = [sys.executable, "-m", "chebsplat.pipelines.cli", "run", "--scene", "toy", "--set", SETTINGS]
+        command = [
+            sys.executable,
+            "-m",
+            "chebsplat.pipelines.cli",
+            "run",
+            "--scene",
+            "toy",
+            "--set",
+            SETTINGS,
+        ]
         done = subprocess.run([*command, "--cores", "2"], cwd=ROOT, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         yield next(store.glob("toy@*"))
@@ -116,7 +129,9 @@ def test_the_rasterizer_s_benchmark_ends_with_1_where_a_bar_is_missed(
 
 
 @pytest.mark.parametrize(("ratio", "code"), [(1.2, 0), (1.3, 1)])
-def test_the_cost_of_a_training_ends_with_1_where_its_bar_is_missed(tmp_path, monkeypatch, capsys, ratio, code):
+def test_the_cost_of_a_training_ends_with_1_where_its_bar_is_missed(
+    tmp_path, monkeypatch, capsys, ratio, code
+):
     monkeypatch.setattr(cost, "by_turns", lambda *_: {"plain": 1.0, "full": ratio, "other": 9.0})
     assert cost.main(["--work", str(tmp_path), "--ablations", "other"]) == code
     assert ("MISSED" in capsys.readouterr().out) == bool(code)

@@ -35,9 +35,13 @@ def warns():
 
 
 @pytest.mark.parametrize(
-    "broken", [lambda: Outcome(2e-6, 1e-6), lambda: Outcome(float("nan"), 1e-6), raises, warns], ids=range(4)
+    "broken",
+    [lambda: Outcome(2e-6, 1e-6), lambda: Outcome(float("nan"), 1e-6), raises, warns],
+    ids=range(4),
 )
-def test_a_case_that_fails_gives_a_non_zero_exit_and_is_named(tmp_path, capsys, monkeypatch, broken):
+def test_a_case_that_fails_gives_a_non_zero_exit_and_is_named(
+    tmp_path, capsys, monkeypatch, broken
+):
     monkeypatch.setitem(CASES, ("none", "meant to fail"), broken)
     assert main.main(["--only", "meant to fail", "--out", str(tmp_path)]) == 1
     with (tmp_path / "stability.csv").open() as handle:
@@ -47,8 +51,14 @@ def test_a_case_that_fails_gives_a_non_zero_exit_and_is_named(tmp_path, capsys, 
 
 def test_a_plain_way_is_measured_beside_ours_and_fails_no_case(tmp_path, capsys, monkeypatch):
     one = np.float32(1)
-    for name, naive in (("raises", raises), ("warns", lambda: one / np.float32(0)), ("misses", lambda: 3 * one)):
-        monkeypatch.setitem(CASES, ("none", name), lambda naive=naive: beside(one, naive, 1.0, 1e-6))
+    for name, naive in (
+        ("raises", raises),
+        ("warns", lambda: one / np.float32(0)),
+        ("misses", lambda: 3 * one),
+    ):
+        monkeypatch.setitem(
+            CASES, ("none", name), lambda naive=naive: beside(one, naive, 1.0, 1e-6)
+        )
     assert main.main(["--only", "none: ", "--out", str(tmp_path)]) == 0
     with (tmp_path / "stability.csv").open() as handle:
         assert [float(row["naive"]) for row in csv.DictReader(handle)] == [np.inf, np.inf, 2.0]

@@ -35,7 +35,12 @@ def test_photos_that_do_not_fit_are_read_when_they_are_looked_at(budget):
         return photos[index]
 
     held = stacked(read, 5, budget)
-    assert isinstance(held, torch.Tensor) == (budget >= photos.nbytes) and tuple(held.shape) == (5, 4, 6, 3)
+    assert isinstance(held, torch.Tensor) == (budget >= photos.nbytes) and tuple(held.shape) == (
+        5,
+        4,
+        6,
+        3,
+    )
     reads.clear()
     cameras = torch.eye(3).repeat(5, 1, 1), torch.eye(4).repeat(5, 1, 1)
     whole, stored = (Views(list("abcde"), images, *cameras) for images in (photos, held))
@@ -54,6 +59,8 @@ def test_views_on_their_device_keep_no_more_of_depth_than_its_reader_does():
         return read[::factor, ::factor]
 
     cameras = torch.eye(3)[None], torch.eye(4)[None]
-    views = Views(["a"], torch.zeros(1, 4, 6, 3, dtype=torch.uint8), *cameras, depth=depth).to("cpu")
+    views = Views(["a"], torch.zeros(1, 4, 6, 3, dtype=torch.uint8), *cameras, depth=depth).to(
+        "cpu"
+    )
     assert views.depth(0, 2).shape == (2, 3)
     assert whole[0]() is None

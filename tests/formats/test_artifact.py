@@ -71,7 +71,8 @@ def test_files_are_as_readable_as_the_umask_says_whoever_wrote_them(tmp_path, um
     before = os.umask(umask)
     try:
         with publishing(tmp_path / "x") as tmp:
-            write_tensors(tmp / "a.safetensors", {"a": np.zeros(3, np.float32)})  # gives its file to the owner alone
+            # gives its file to the owner alone
+            write_tensors(tmp / "a.safetensors", {"a": np.zeros(3, np.float32)})
             (tmp / "b.txt").write_text("b")
     finally:
         os.umask(before)
@@ -86,7 +87,9 @@ def tear(path):
     return path
 
 
-def test_a_damaged_artifact_is_replaced_in_the_folder_that_bears_its_key_and_a_twin_s_is_kept(tmp_path):
+def test_a_damaged_artifact_is_replaced_in_the_folder_that_bears_its_key_and_a_twin_s_is_kept(
+    tmp_path,
+):
     path = tear(make(tmp_path / KEY))
     assert not artifact.is_whole(path)
     assert (make(path, "again") / "data/a.txt").read_text() == "again"
@@ -100,7 +103,9 @@ def test_a_damaged_artifact_is_replaced_in_the_folder_that_bears_its_key_and_a_t
     assert os.listdir(tmp_path) == [KEY]
 
 
-def test_readers_see_a_whole_artifact_or_none_while_a_damaged_one_is_replaced(tmp_path, monkeypatch):
+def test_readers_see_a_whole_artifact_or_none_while_a_damaged_one_is_replaced(
+    tmp_path, monkeypatch
+):
     path, seen = tear(make(tmp_path / KEY)), []
     rename = os.rename
 
@@ -108,14 +113,18 @@ def test_readers_see_a_whole_artifact_or_none_while_a_damaged_one_is_replaced(tm
         try:
             rename(source, target)
         finally:
-            seen.append("whole" if artifact.is_whole(path) else "damaged" if path.exists() else "none")
+            seen.append(
+                "whole" if artifact.is_whole(path) else "damaged" if path.exists() else "none"
+            )
 
     monkeypatch.setattr(os, "rename", watched)
     make(path)
     assert seen == ["damaged", "none", "whole"]  # the first finds that something stands there
 
 
-OTHERS = {what: stands for what, (stands, place, _) in PLACES.items() if place == "mine"} | {"a note": with_a_note}
+OTHERS = {what: stands for what, (stands, place, _) in PLACES.items() if place == "mine"} | {
+    "a note": with_a_note
+}
 
 
 @pytest.mark.parametrize("force", [False, True])
@@ -124,8 +133,12 @@ def test_publishing_never_replaces_what_is_not_this_stage_s_artifact(tmp_path, s
     out = tmp_path / "mine"
     stands(out)
     before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
-    if force or not artifact.is_whole(out, SCHEMA):  # a whole one is kept without a word, as a twin's is
-        with pytest.raises(InputError, match=f"{out}.*nothing was replaced") as error, publishing(out, "new", force):
+    # a whole one is kept without a word, as a twin's is
+    if force or not artifact.is_whole(out, SCHEMA):
+        with (
+            pytest.raises(InputError, match=f"{out}.*nothing was replaced") as error,
+            publishing(out, "new", force),
+        ):
             pass
         assert "delete" not in str(error.value)
     with pytest.raises(ValueError, match="no scratch"):

@@ -1,4 +1,6 @@
-"""The feature store: the same bytes in any order and after any kill; damage and bad values are named."""
+"""The feature store: the same bytes in any order and after any kill; damage and bad values are
+named.
+"""
 
 import json
 import random
@@ -21,11 +23,17 @@ LABELS = (["wall", "floor"], np.eye(2, 3, dtype=np.float32), {"normalized": True
 def view(k, shape=SHAPE):
     rng = np.random.default_rng(k)
     size = shape[:2]
-    return rng.normal(size=shape).astype(np.float32), rng.integers(0, 2, size), rng.random(size, dtype=np.float32)
+    return (
+        rng.normal(size=shape).astype(np.float32),
+        rng.integers(0, 2, size),
+        rng.random(size, dtype=np.float32),
+    )
 
 
 def contents(folder):
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()
+    }
 
 
 def finished(writer, out):
@@ -54,11 +62,15 @@ def test_a_stack_written_at_once_has_the_bytes_of_its_views(tmp_path, whole):
     stacks = [np.stack(arrays) for arrays in zip(*map(view, range(4)), strict=True)]
     labels = dict(zip(("label_names", "label_embeddings", "convention"), LABELS, strict=True))
     (tmp_path / "out").mkdir()
-    Features(NAMES, stacks[0], pseudo_labels=stacks[1], confidence=stacks[2], **labels).write(tmp_path / "out")
+    Features(NAMES, stacks[0], pseudo_labels=stacks[1], confidence=stacks[2], **labels).write(
+        tmp_path / "out"
+    )
     assert contents(tmp_path / "out") == whole
 
 
-@pytest.mark.parametrize("left", ["half a view", "no mark", "mark without files", "part of a mark", "no metadata"])
+@pytest.mark.parametrize(
+    "left", ["half a view", "no mark", "mark without files", "part of a mark", "no metadata"]
+)
 def test_whatever_a_kill_leaves_is_written_anew(tmp_path, whole, left):
     folder = tmp_path / "w"
     written(folder, [3, 1])
@@ -99,8 +111,18 @@ for k in sorted(set(range(len(writer.names))) - writer.done):
 def test_killed_at_random_moments_it_goes_on_and_leaves_the_same_bytes(tmp_path, whole):
     rng, seen, code = random.Random(0), [], None
     stacks = [np.stack(arrays) for arrays in zip(*map(view, range(4)), strict=True)]
-    np.savez(tmp_path / "views.npz", **dict(zip(("features", "labels", "confidence"), stacks, strict=True)))
-    command = [sys.executable, "-c", KILLED, tmp_path / "views.npz", tmp_path / "w", json.dumps(NAMES)]
+    np.savez(
+        tmp_path / "views.npz",
+        **dict(zip(("features", "labels", "confidence"), stacks, strict=True)),
+    )
+    command = [
+        sys.executable,
+        "-c",
+        KILLED,
+        tmp_path / "views.npz",
+        tmp_path / "w",
+        json.dumps(NAMES),
+    ]
     for attempt in range(4):
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdout.readline() == "ready\n"
@@ -155,7 +177,9 @@ def test_every_bit_of_a_view_is_guarded(tmp_path):
     good = chunk.read_bytes()
     found = Features.read(path).features
     for place in range(len(good)):
-        chunk.write_bytes(good[:place] + bytes([good[place] ^ (1 << place % 8)]) + good[place + 1 :])
+        chunk.write_bytes(
+            good[:place] + bytes([good[place] ^ (1 << place % 8)]) + good[place + 1 :]
+        )
         with pytest.raises(InputError, match="does not match its sha256"):
             found[0]
     chunk.write_bytes(good)

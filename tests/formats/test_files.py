@@ -5,7 +5,14 @@ import os
 import pytest
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.formats.files import atomic_path, atomic_write, parse_json, parse_toml, read_text, regular
+from chebsplat.formats.files import (
+    atomic_path,
+    atomic_write,
+    parse_json,
+    parse_toml,
+    read_text,
+    regular,
+)
 
 
 def write(path, content):
@@ -13,7 +20,9 @@ def write(path, content):
     return path
 
 
-@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "dangling", "looping", "absent", "too long", "null"])
+@pytest.mark.parametrize(
+    "kind", ["pipe", "device", "folder", "dangling", "looping", "absent", "too long", "null"]
+)
 def test_what_is_no_file_is_refused_at_once(tmp_path, kind):
     path = tmp_path / {"too long": "x" * 300, "null": "a\0b"}.get(kind, "a.json")
     if kind == "pipe":
@@ -21,7 +30,9 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, kind):
     elif kind == "folder":
         path.mkdir()
     elif kind in ("device", "dangling", "looping"):
-        path.symlink_to({"device": "/dev/zero", "dangling": tmp_path / "none", "looping": path}[kind])
+        path.symlink_to(
+            {"device": "/dev/zero", "dangling": tmp_path / "none", "looping": path}[kind]
+        )
     for read in (regular, read_text, parse_json, parse_toml):
         with pytest.raises(InputError, match="; restore the file"):
             read(path)
@@ -29,7 +40,17 @@ def test_what_is_no_file_is_refused_at_once(tmp_path, kind):
 
 @pytest.mark.parametrize(
     "text",
-    ["[" * 100_000, '{"a":' * 100_000, "1" * 5000, '"\\ud800"', '"\\udc80"', b"\xff", "{", "", '{"a": 1, "a": 2}'],
+    [
+        "[" * 100_000,
+        '{"a":' * 100_000,
+        "1" * 5000,
+        '"\\ud800"',
+        '"\\udc80"',
+        b"\xff",
+        "{",
+        "",
+        '{"a": 1, "a": 2}',
+    ],
 )
 def test_json_that_cannot_be_used_is_named(tmp_path, text):
     with pytest.raises(InputError, match=r"a\.json .*; restore the file"):
@@ -38,7 +59,14 @@ def test_json_that_cannot_be_used_is_named(tmp_path, text):
 
 @pytest.mark.parametrize(
     "text",
-    ["a = " + "[" * 100_000, "a = " + "{a=" * 100_000, "a." * 400_000 + "a = 1", "[a", b"a = '\xff'", "a = 1\n" * 2],
+    [
+        "a = " + "[" * 100_000,
+        "a = " + "{a=" * 100_000,
+        "a." * 400_000 + "a = 1",
+        "[a",
+        b"a = '\xff'",
+        "a = 1\n" * 2,
+    ],
 )
 def test_toml_that_cannot_be_used_is_named(tmp_path, text):
     with pytest.raises(ConfigError, match=r"a\.toml .*; correct it"):
@@ -53,7 +81,9 @@ def test_a_file_of_gigabytes_is_refused_unread(tmp_path):
 
 
 def test_names_in_any_language_and_a_byte_order_mark_are_read(tmp_path):
-    assert parse_json(write(tmp_path / "a.json", "\ufeff" + '{"é": "\\ud83d\\ude00"}')) == {"é": "😀"}
+    assert parse_json(write(tmp_path / "a.json", "\ufeff" + '{"é": "\\ud83d\\ude00"}')) == {
+        "é": "😀"
+    }
     assert parse_toml(write(tmp_path / "a.toml", "\ufeffa.b.c = '沙'")) == {"a": {"b": {"c": "沙"}}}
 
 

@@ -1,4 +1,6 @@
-"""Every artifact reads back what was written; every kind of damage to every file is named with its remedy."""
+"""Every artifact reads back what was written; every kind of damage to every file is named with its
+remedy.
+"""
 
 from dataclasses import replace
 from functools import reduce
@@ -86,16 +88,21 @@ def make_descriptors():
     rng = np.random.default_rng(4)
     arrays = [rng.normal(size=(5, width)).astype(np.float32) for width in (6, 3, 3, 8)]
     neighbors = rng.integers(-1, 5, (5, 4, 2)).astype(np.int32)
-    return descriptors.Descriptors(*arrays, neighbors, [0.0, 1, 2], [0.0, 0, 1], 2.5, {"of": "depth"})
+    return descriptors.Descriptors(
+        *arrays, neighbors, [0.0, 1, 2], [0.0, 0, 1], 2.5, {"of": "depth"}
+    )
 
 
 def make_encoding():
-    return encoding.Encoding(np.random.default_rng(9).normal(size=(5, 7)).astype(np.float16), {"none": "why"})
+    return encoding.Encoding(
+        np.random.default_rng(9).normal(size=(5, 7)).astype(np.float16), {"none": "why"}
+    )
 
 
 def make_sums():
     z = np.random.default_rng(10).normal(size=(20, 7)).astype(np.float32)
-    gram, cross = (z.T @ z).astype(np.float64), (z.T @ z[:, :3]).astype(np.float64)  # what float32 holds exactly
+    # what float32 holds exactly
+    gram, cross = (z.T @ z).astype(np.float64), (z.T @ z[:, :3]).astype(np.float64)
     return np.tril(gram) + np.tril(gram, -1).T, cross, 1.1
 
 
@@ -131,13 +138,25 @@ def make_evaluation():
         "renders": rng.integers(0, 255, (2, 3, 4, 3), dtype=np.uint8),
         "labels": np.zeros((2, 3, 4), np.int16),
     }
-    figures = {"names": ["a", "b"], "image": {"psnr": 30.0, "ssim": 0.9, "per_view": {"psnr": [29.0, 31.0]}}}
-    figures |= {"n_gaussians": 5, "bytes": {"ply": 7}, "frames_per_second": {}, "left_out": {}, "lpips": None}
+    figures = {
+        "names": ["a", "b"],
+        "image": {"psnr": 30.0, "ssim": 0.9, "per_view": {"psnr": [29.0, 31.0]}},
+    }
+    figures |= {
+        "n_gaussians": 5,
+        "bytes": {"ply": 7},
+        "frames_per_second": {},
+        "left_out": {},
+        "lpips": None,
+    }
     return evaluation.Evaluation(figures, pictures)
 
 
 def make_agreement():
-    labels = {"wall": {"share": 0.75, "agreement": 0.5}, "floor": {"share": 0.25, "agreement": 0.25}}
+    labels = {
+        "wall": {"share": 0.75, "agreement": 0.5},
+        "floor": {"share": 0.25, "agreement": 0.25},
+    }
     return evaluation.ViewAgreement(0.375, 40, 2, labels)
 
 
@@ -156,17 +175,29 @@ def make_lifted():
 
 def make_refined():
     rng = np.random.default_rng(8)
-    notes = {"start": "trained", "smooth": True, "strength": 2.0, "curve": {"off": {"0": 0.9}, "on": {"0": 0.95}}}
-    return lifted.Refined(rng.normal(size=(6, 4)).astype(np.float32), rng.random(6, dtype=np.float32), notes)
+    notes = {
+        "start": "trained",
+        "smooth": True,
+        "strength": 2.0,
+        "curve": {"off": {"0": 0.9}, "on": {"0": 0.95}},
+    }
+    return lifted.Refined(
+        rng.normal(size=(6, 4)).astype(np.float32), rng.random(6, dtype=np.float32), notes
+    )
 
 
 def make_knowledge():
     weights = {"embed.0.weight": np.random.default_rng(8).normal(size=(4, 6)).astype(np.float32)}
-    matrix, answers = np.eye(7, 3, dtype=np.float32), [np.eye(7, n, dtype=np.float32) for n in (3, 2)]
+    matrix, answers = (
+        np.eye(7, 3, dtype=np.float32),
+        [np.eye(7, n, dtype=np.float32) for n in (3, 2)],
+    )
     of = "a", "b", {"n_channels": 3}, weights, matrix, {"n_angles": 8}
     words = ["sofa", "wall"], np.eye(2, 3, dtype=np.float16)
     card = {"n_rooms": 2}, {"share": 3.0}
-    return knowledge.Knowledge(*of, *words, *answers, np.ones(7, np.float32), *card, [make_sums()] * 2)
+    return knowledge.Knowledge(
+        *of, *words, *answers, np.ones(7, np.float32), *card, [make_sums()] * 2
+    )
 
 
 CASES = {
@@ -238,7 +269,11 @@ DAMAGES = {
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 def test_damage_to_any_file_is_named_with_its_remedy(case, damage):
     _, read, path = case
-    for file in sorted(p for p in path.rglob("*") if p.is_file() and p.suffix != ".ply" and p.name != "artifact.json"):
+    for file in sorted(
+        p
+        for p in path.rglob("*")
+        if p.is_file() and p.suffix != ".ply" and p.name != "artifact.json"
+    ):
         good = file.read_bytes()
         damage(file.name)(file.parent)
         with pytest.raises(InputError, match="run its stage again") as error:
@@ -252,7 +287,16 @@ def test_damage_to_any_file_is_named_with_its_remedy(case, damage):
 
 @pytest.mark.xdist_group("toy")
 def test_every_numeric_artifact_of_a_scene_opens_as_a_zarr_group(toy):
-    kinds = {"features/2", "gaussians/2", "scene/3", "capture/2", "points/2", "channels/2", "agreement/2", "lifted/2"}
+    kinds = {
+        "features/2",
+        "gaussians/2",
+        "scene/3",
+        "capture/2",
+        "points/2",
+        "channels/2",
+        "agreement/2",
+        "lifted/2",
+    }
     kinds |= {"refined/2", "evaluation/2", "descriptors/2", "encoding/1"}
     opened = set()
     for path in toy.values():
@@ -263,7 +307,9 @@ def test_every_numeric_artifact_of_a_scene_opens_as_a_zarr_group(toy):
                 values = reduce(lambda within, part: within[part], name.split("/"), group)[:]
                 assert len(axes) == values.ndim, (path, name)
                 named = zip(axes, values.shape, strict=True)
-                assert all(n == (lengths.setdefault(a, n) if isinstance(a, str) else a) for a, n in named)
+                assert all(
+                    n == (lengths.setdefault(a, n) if isinstance(a, str) else a) for a, n in named
+                )
             opened.add(group.attrs["schema"].removeprefix("chebsplat."))
     assert opened == kinds
 
@@ -334,7 +380,9 @@ def test_full_ply_has_the_62_float_header(tmp_path):
 
 def test_tags_follow_the_62_floats_as_floats_and_names_are_comments(tmp_path):
     labels = np.array([0, 2, -1, 2, 2, 0])
-    ply.write_ply(tmp_path / "a.ply", gaussian_parameters(), 3, labels, ["wall", "lamp", "round table"])
+    ply.write_ply(
+        tmp_path / "a.ply", gaussian_parameters(), 3, labels, ["wall", "lamp", "round table"]
+    )
     found = PlyData.read(str(tmp_path / "a.ply"))
     assert [(p.name, p.val_dtype) for p in found["vertex"].properties][-3:] == [
         ("rot_3", "f4"),
@@ -350,7 +398,8 @@ def test_fixed_point_features_are_within_half_a_step(tmp_path):
     published(tmp_path / "s", record)
     wanted = record.parameters["features"]
     found = scene.Scene.read(tmp_path / "s").parameters["features"]
-    assert np.abs(found - wanted).max() <= 0.51 * np.abs(wanted).max() / 32767  # half a step, and float32's own
+    # half a step, and float32's own
+    assert np.abs(found - wanted).max() <= 0.51 * np.abs(wanted).max() / 32767
 
 
 def test_split_ply_files_hold_the_same_gaussians(tmp_path):

@@ -1,4 +1,6 @@
-"""Checkpoints come back bit for bit, without SH bands that nobody keeps; bad parameters are never published."""
+"""Checkpoints come back bit for bit, without SH bands that nobody keeps; bad parameters are never
+published.
+"""
 
 import numpy as np
 import pytest

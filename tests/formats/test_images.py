@@ -74,7 +74,9 @@ def test_an_image_is_judged_by_its_header_before_a_pixel_is_decoded(tmp_path):
 
 def test_a_phones_double_picture_opens_as_its_first(tmp_path):
     held = io.BytesIO()
-    Image.new("RGB", (8, 6), (9, 9, 9)).save(held, "MPO", save_all=True, append_images=[Image.new("RGB", (8, 6))])
+    Image.new("RGB", (8, 6), (9, 9, 9)).save(
+        held, "MPO", save_all=True, append_images=[Image.new("RGB", (8, 6))]
+    )
     (tmp_path / "a.jpg").write_bytes(held.getvalue())
     assert read_rgb(tmp_path / "a.jpg").mean() == 9
 

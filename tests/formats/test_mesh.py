@@ -1,4 +1,6 @@
-"""A scene's mesh lies on its surface, in its frame; what floats goes, holes close, and both files say the same."""
+"""A scene's mesh lies on its surface, in its frame; what floats goes, holes close, and both files
+say the same.
+"""
 
 import json
 import struct
@@ -26,7 +28,9 @@ def of_a_ball(radius=0.5):
             center = pose[:3, 3]
             squared, along = (rays**2).sum(-1), rays @ center
             root = along**2 - squared * (center @ center - radius**2)
-            depth = np.where(root > 0, (along - np.sqrt(np.maximum(root, 0))) / squared, 0).astype(np.float32)
+            depth = np.where(root > 0, (along - np.sqrt(np.maximum(root, 0))) / squared, 0).astype(
+                np.float32
+            )
             yield Frame(depth, np.full((*depth.shape, 3), (200, 40, 90), np.uint8), K, pose)
 
 
@@ -38,7 +42,8 @@ def ball():
 def test_a_fused_mesh_lies_on_the_surface_in_the_cameras_world_and_bears_its_colour(ball):
     radii = np.linalg.norm(ball.vertices, axis=1)
     assert len(ball.triangles) > 1000
-    assert np.quantile(np.abs(radii - 0.5), 0.9) < 0.012  # half a voxel; distances along rays grow at the ball's rim
+    # half a voxel; distances along rays grow at the ball's rim
+    assert np.quantile(np.abs(radii - 0.5), 0.9) < 0.012
     assert np.abs(ball.vertices.mean(0)).max() < 0.005
     assert np.abs(ball.colors.astype(int) - (200, 40, 90)).max() <= 1
 
@@ -62,7 +67,9 @@ def test_views_without_depth_make_an_empty_mesh():
 
 def test_cleaning_removes_what_floats_closes_holes_and_keeps_to_the_number_of_triangles(ball):
     pytest.importorskip("pymeshlab", reason="the extra mesh is not installed")
-    holed = ball.triangles[np.linalg.norm(ball.vertices[ball.triangles].mean(1) - (0, 0.5, 0), axis=1) > 0.05]
+    holed = ball.triangles[
+        np.linalg.norm(ball.vertices[ball.triangles].mean(1) - (0, 0.5, 0), axis=1) > 0.05
+    ]
     speck = np.array([[2, 2, 2], [2.02, 2, 2], [2, 2.02, 2]], np.float32)
     mesh = Mesh(
         np.concatenate([ball.vertices, speck]),
@@ -81,7 +88,8 @@ def test_cleaning_removes_what_floats_closes_holes_and_keeps_to_the_number_of_tr
 
 def test_clustering_leaves_what_is_wanted_and_keeps_the_surface(monkeypatch):
     pytest.importorskip("pymeshlab", reason="the extra mesh is not installed")
-    monkeypatch.setattr("chebsplat.formats.meshes.EASY", 1)  # nothing is left to the collapse but the excess
+    # nothing is left to the collapse but the excess
+    monkeypatch.setattr("chebsplat.formats.meshes.EASY", 1)
     fine = fused(open3d(), of_a_ball(), 0.01, 5.0)
     for wanted in (len(fine.triangles) // 2, len(fine.triangles) // 8):
         found = cleaned(fine, wanted, 0.2, 100, 0.01)
@@ -113,7 +121,9 @@ def test_both_files_hold_the_same_mesh(ball, tmp_path):
     write_mesh(tmp_path / "a.ply", mesh, names)
     write_mesh(tmp_path / "a.glb", mesh, names)
     read = PlyData.read(tmp_path / "a.ply")
-    np.testing.assert_array_equal(np.stack([read["vertex"][axis] for axis in "xyz"], 1), mesh.vertices)
+    np.testing.assert_array_equal(
+        np.stack([read["vertex"][axis] for axis in "xyz"], 1), mesh.vertices
+    )
     np.testing.assert_array_equal(np.stack(read["face"]["vertex_indices"]), mesh.triangles)
     np.testing.assert_array_equal(read["vertex"]["label"], labels)
     assert read.comments == ["label 0 table", r"label 1 caf\xe9"]

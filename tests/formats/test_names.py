@@ -1,4 +1,6 @@
-"""Labels in any language go through a scene's files; names that nothing could print or write are refused."""
+"""Labels in any language go through a scene's files; names that nothing could print or write are
+refused.
+"""
 
 import numpy as np
 import pytest
@@ -24,7 +26,9 @@ def scene(tmp_path):
     p["features"] = np.eye(len(LABELS), dtype=np.float32)
     cameras = Cameras(["a"], np.eye(3)[None], np.eye(4)[None], 5, 4)
     labels = np.arange(len(LABELS), dtype=np.int32)
-    held = Scene(p, cameras, labels.astype(np.int64), labels, LABELS, p["features"], {"left_out": {}})
+    held = Scene(
+        p, cameras, labels.astype(np.int64), labels, LABELS, p["features"], {"left_out": {}}
+    )
     with artifact.publish(tmp_path / "scene", Manifest(Scene.SCHEMA, "0" * 16, "export")) as tmp:
         held.write(tmp)
     return tmp_path / "scene"
@@ -58,7 +62,16 @@ def test_names_that_could_not_be_used_are_refused(names):
 
 
 def test_views_of_one_file_name_keep_their_pictures_apart():
-    views = ["a/img.jpg", "b/img.jpg", "a-img.png", "A/IMG.jpg", "../x.jpg", "沙/é.jpg", "...", "view_000"]
+    views = [
+        "a/img.jpg",
+        "b/img.jpg",
+        "a-img.png",
+        "A/IMG.jpg",
+        "../x.jpg",
+        "沙/é.jpg",
+        "...",
+        "view_000",
+    ]
     found = file_names(views)
     assert len({name.lower() for name in found}) == len(views)
     assert not any("/" in name or name.startswith(".") for name in found)

@@ -60,7 +60,10 @@ def test_what_unpacks_to_more_than_it_may_is_refused_by_its_size(tmp_path):
         read_npz(tmp_path / "bomb.npz", ["rows"], "write it again", largest=1000)
     with pytest.raises(InputError, match="at most"):  # in all, not each
         read_npz(tmp_path / "bomb.npz", ["rows", "more"], "write it again", largest=100_000)
-    assert read_npz(tmp_path / "bomb.npz", ["rows"], "write it again", largest=100_000)["rows"].size == 10_000
+    assert (
+        read_npz(tmp_path / "bomb.npz", ["rows"], "write it again", largest=100_000)["rows"].size
+        == 10_000
+    )
 
 
 def test_what_is_no_regular_file_is_refused_without_waiting(tmp_path):

@@ -1,4 +1,6 @@
-"""Weights beside a graph are found wherever in it they are named, and are part of what a model is."""
+"""Weights beside a graph are found wherever in it they are named, and are part of what a model
+is.
+"""
 
 import pytest
 from onnx import AttributeProto, GraphProto, ModelProto, NodeProto, SparseTensorProto, TensorProto
@@ -17,7 +19,9 @@ def outside(location):
 
 
 def constant(location):
-    return NodeProto(op_type="Constant", attribute=[AttributeProto(name="value", t=outside(location))])
+    return NodeProto(
+        op_type="Constant", attribute=[AttributeProto(name="value", t=outside(location))]
+    )
 
 
 def branch(location):
@@ -27,7 +31,9 @@ def branch(location):
 
 PLACES = {
     "initializer": lambda at: ModelProto(graph=GraphProto(initializer=[outside(at)])),
-    "sparse": lambda at: ModelProto(graph=GraphProto(sparse_initializer=[SparseTensorProto(values=outside(at))])),
+    "sparse": lambda at: ModelProto(
+        graph=GraphProto(sparse_initializer=[SparseTensorProto(values=outside(at))])
+    ),
     "constant": lambda at: ModelProto(graph=GraphProto(node=[constant(at)])),
     "branch": lambda at: ModelProto(graph=GraphProto(node=[branch(at)])),
     "function": lambda at: ModelProto(functions=[{"node": [constant(at)]}]),
@@ -40,7 +46,11 @@ def test_weights_are_found_and_count_wherever_a_graph_names_them(tmp_path, place
     path, weights = tmp_path / "model.onnx", tmp_path / "parts/weights.bin"
     path.write_bytes(PLACES[place]("parts/weights.bin").SerializeToString())
     weights.parent.mkdir()
-    with pytest.raises(InputError, match=r"parts/weights.bin is missing; .*model.onnx keeps weights there"):
+    with pytest.raises(
+        InputError,
+        match=r"parts/weights.bin is missing; .*model.onnx keeps "
+        r"weights there",
+    ):
         model_files(path)
     weights.write_bytes(b"1234")
     assert model_files(path) == [path, weights]

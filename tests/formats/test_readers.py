@@ -1,7 +1,8 @@
-"""Every exported layout opens in readers that know nothing of chebsplat: counts, positions and tags agree.
+"""Every exported layout opens in readers that know nothing of chebsplat: counts, positions and tags
+agree.
 
-From PyPI gsply, Open3D, plyfile and zarr; from npm splat-transform (PlayCanvas), Spark and zarrita, installed into
-build/readers by the first test that wants them.
+From PyPI gsply, Open3D, plyfile and zarr; from npm splat-transform (PlayCanvas), Spark and zarrita,
+installed into build/readers by the first test that wants them.
 """
 
 import csv
@@ -18,9 +19,15 @@ from chebsplat.formats.scene import Scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("readers")]
 
-NPM = {"@playcanvas/splat-transform": "2.7.1", "@sparkjsdev/spark": "2.2.0", "three": "0.187.0", "zarrita": "0.7.5"}
+NPM = {
+    "@playcanvas/splat-transform": "2.7.1",
+    "@sparkjsdev/spark": "2.2.0",
+    "three": "0.187.0",
+    "zarrita": "0.7.5",
+}
 NAMES = ["wall", "floor", "round table"]
-CONVERSIONS = {"scene.compressed.ply": [], "scene.spz": ["--spz-version", "3"]}  # as the README gives them
+# as the README gives them
+CONVERSIONS = {"scene.compressed.ply": [], "scene.spz": ["--spz-version", "3"]}
 GRID = 2.0**-12  # of SPZ's positions
 
 
@@ -34,7 +41,16 @@ def packages():
     stamp = folder / "installed"
     if not stamp.is_file() or stamp.read_text() != "\n".join(wanted):
         folder.mkdir(parents=True, exist_ok=True)
-        command = ["npm", "install", "--prefix", str(folder), "--no-save", "--ignore-scripts", "--no-audit", *wanted]
+        command = [
+            "npm",
+            "install",
+            "--prefix",
+            str(folder),
+            "--no-save",
+            "--ignore-scripts",
+            "--no-audit",
+            *wanted,
+        ]
         subprocess.run(command, check=True, capture_output=True)
         stamp.write_text("\n".join(wanted))
     return folder / "node_modules"
@@ -63,7 +79,11 @@ def converted(exported, packages):
 
 def transform(packages, *arguments):
     cli = packages / "@playcanvas/splat-transform/bin/cli.mjs"
-    subprocess.run(["node", cli, "--quiet", "--overwrite", *map(str, arguments)], check=True, capture_output=True)
+    subprocess.run(
+        ["node", cli, "--quiet", "--overwrite", *map(str, arguments)],
+        check=True,
+        capture_output=True,
+    )
 
 
 def by_splat_transform(path, packages, tmp_path):
@@ -78,7 +98,14 @@ def by_spark(path, packages, tmp_path):
     """Positions in the axes of the file."""
     import gsply
 
-    command = ["node", ROOT / "tests/support/readers.mjs", "spark", path, tmp_path / "out.spz", packages]
+    command = [
+        "node",
+        ROOT / "tests/support/readers.mjs",
+        "spark",
+        path,
+        tmp_path / "out.spz",
+        packages,
+    ]
     subprocess.run([str(c) for c in command], check=True, capture_output=True)
     return gsply.read_spz(tmp_path / "out.spz").means
 
@@ -124,7 +151,9 @@ def test_ply_opens_in_open3d_tags_included(exported, name):
 def test_ply_opens_in_splat_transform_tags_included(exported, name, packages, tmp_path):
     p, labels = part_of(*exported[1:], name)
     found = by_splat_transform(exported[0] / name, packages, tmp_path)
-    assert np.array_equal(np.stack([found[axis] for axis in "xyz"], 1).astype(np.float32), p["means"])
+    assert np.array_equal(
+        np.stack([found[axis] for axis in "xyz"], 1).astype(np.float32), p["means"]
+    )
     assert np.array_equal(found["opacity"].astype(np.float32), p["logit_opacities"])
     assert np.array_equal(found["label"], labels)
     assert np.array_equal(found["sh_degree"], p["degrees"])
@@ -150,7 +179,10 @@ def test_compressed_ply_opens_in_gsply_and_spark(exported, converted, packages, 
     distance, match = cKDTree(means).query(found)
     assert distance.max() < step
     assert len(np.unique(match)) > 0.99 * len(means)
-    assert np.abs(by_spark(converted / "scene.compressed.ply", packages, tmp_path) - found).max() <= 1.01 * GRID
+    assert (
+        np.abs(by_spark(converted / "scene.compressed.ply", packages, tmp_path) - found).max()
+        <= 1.01 * GRID
+    )
 
 
 def test_spz_opens_in_gsply_and_spark_and_is_version_3(exported, converted, packages, tmp_path):
@@ -167,9 +199,13 @@ def test_spz_opens_in_gsply_and_spark_and_is_version_3(exported, converted, pack
     assert np.abs(found.means - turned).max() <= 1.01 * GRID
     # 1/16 of log-scale, cut to [-10, 6); 8 bits of opacity
     assert np.abs(found.scales - p["log_scales"]).max() <= 0.51 / 16
-    opacities, wanted = (1 / (1 + np.exp(-v.astype(float).ravel())) for v in (found.opacities, p["logit_opacities"]))
+    opacities, wanted = (
+        1 / (1 + np.exp(-v.astype(float).ravel())) for v in (found.opacities, p["logit_opacities"])
+    )
     assert np.abs(opacities - wanted).max() <= 1.01 / 255
-    assert np.abs(by_spark(converted / "scene.spz", packages, tmp_path) - turned).max() <= 2.01 * GRID
+    assert (
+        np.abs(by_spark(converted / "scene.spz", packages, tmp_path) - turned).max() <= 2.01 * GRID
+    )
 
 
 def test_compressed_files_are_small(exported, converted):
@@ -185,9 +221,18 @@ def test_ragged_arrays_open_in_zarr_and_zarrita(exported, name, packages, tmp_pa
     path, p, _ = exported
     group = zarr.open_group(str(path), mode="r")
     plain = np.asarray(group[name][:])
-    command = ["node", ROOT / "tests/support/readers.mjs", "zarrita", path / name, tmp_path / "out.bin", packages]
+    command = [
+        "node",
+        ROOT / "tests/support/readers.mjs",
+        "zarrita",
+        path / name,
+        tmp_path / "out.bin",
+        packages,
+    ]
     subprocess.run([str(c) for c in command], check=True, capture_output=True)
-    assert np.array_equal(np.fromfile(tmp_path / "out.bin", plain.dtype).reshape(plain.shape), plain)
+    assert np.array_equal(
+        np.fromfile(tmp_path / "out.bin", plain.dtype).reshape(plain.shape), plain
+    )
     band = int(name[-1]) if name[-1].isdigit() else 0
     if band:
         wanted = p["shN"][p["degrees"] >= band, band**2 - 1 : (band + 1) ** 2 - 1]

@@ -1,4 +1,6 @@
-"""Splats of other programs' formats hold what their specifications say, in the axes of a PLY file."""
+"""Splats of other programs' formats hold what their specifications say, in the axes of a PLY
+file.
+"""
 
 import gzip
 import logging
@@ -71,7 +73,10 @@ def test_spz_of_gsply_is_turned_into_the_axes_of_a_ply(tmp_path, degree):
     looks = np.random.default_rng(2).normal(size=(50, 3))
     looks /= np.linalg.norm(looks, axis=1, keepdims=True)
     seen, turned = (basis(torch.from_numpy(d), 3)[:, 1:].numpy() for d in (looks, looks @ half))
-    colors = np.einsum("dk,nkc->ndc", turned, found["shN"]), np.einsum("dk,nkc->ndc", seen, p["shN"])
+    colors = (
+        np.einsum("dk,nkc->ndc", turned, found["shN"]),
+        np.einsum("dk,nkc->ndc", seen, p["shN"]),
+    )
     assert np.abs(colors[0] - colors[1]).max() < 0.6 / 128 * np.abs(seen).sum(1).max()
 
 
@@ -80,9 +85,17 @@ def test_spz_of_version_2_holds_quaternions_of_three_bytes(tmp_path):
     p = given(0)
     fixed = np.round(p["means"] * 4096).astype("<i4").view(np.uint8).reshape(N, 3, 4)[..., :3]
     quats = p["quats"] * np.sign(p["quats"][:, :1])
-    planes = [fixed, np.full(N, 255), np.full((N, 3), 128), np.full((N, 3), 96), np.round((quats[:, 1:] + 1) * 127.5)]
+    planes = [
+        fixed,
+        np.full(N, 255),
+        np.full((N, 3), 128),
+        np.full((N, 3), 96),
+        np.round((quats[:, 1:] + 1) * 127.5),
+    ]
     body = b"".join(np.asarray(plane).astype(np.uint8).tobytes() for plane in planes)
-    (tmp_path / "a.spz").write_bytes(gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 2, N, 0, 12, 0) + body, mtime=0))
+    (tmp_path / "a.spz").write_bytes(
+        gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 2, N, 0, 12, 0) + body, mtime=0)
+    )
     found = read_splats(tmp_path / "a.spz")[0]
     assert np.abs(found["means"] - p["means"] * [1, -1, -1]).max() < 0.51 / 4096
     alike(found["quats"], quats * [1, 1, -1, -1], 0.02)  # three bytes tell little where w is small
@@ -110,9 +123,18 @@ def test_a_splat_of_32_bytes_a_gaussian_reads(tmp_path):
     ("a.SOG", b"any", r"\.sog is not read \(\.ply, \.spz, \.splat are\)"),
     ("a.splat", bytes(33), "no multiple of 32"),
     ("a.spz", b"any", "is cut or no SPZ"),
-    ("a.spz", struct.pack("<4sIIBBBx", b"NGSP", 4, 1, 0, 12, 0) + bytes(16), r"\(b'NGSP', version 4\); export"),
-    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 1, 1, 0, 12, 0), mtime=0), "no SPZ of version 2 or 3"),
-    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 3, 2**32 - 1, 3, 12, 0), mtime=0), "is cut, or has more"),
+    ("a.spz", struct.pack("<4sIIBBBx", b"NGSP", 4, 1, 0, 12, 0) + bytes(16), r"\(b'NGSP', version 4\); "
+                                                                             r""
+                                                                             r""
+                                                                             r"export"),
+    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 1, 1, 0, 12, 0), mtime=0), "no SPZ of version 2 or "
+                                                                                         ""
+                                                                                         ""
+                                                                                         "3"),
+    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 3, 2**32 - 1, 3, 12, 0), mtime=0), "is cut, or has "
+                                                                                                 ""
+                                                                                                 ""
+                                                                                                 "more"),
     ("a.spz", gzip.compress(bytes(9), mtime=0)[:-9], "no SPZ"),
 ])  # fmt: skip
 def test_what_is_no_splat_that_is_read_says_what_to_do(tmp_path, name, content, word):
@@ -129,7 +151,11 @@ def test_of_a_folder_of_3dgs_the_last_iteration_is_taken(tmp_path):
         p = given() | {"logit_opacities": np.full(N, step / 1e4, np.float32)}
         ply.write_ply(tmp_path / f"point_cloud/iteration_{step}/point_cloud.ply", p, 3)
     assert read_splats(tmp_path)[0]["logit_opacities"][0] == 3
-    assert is_splat(str(tmp_path)) and all(is_splat(f"a{end}") for end in READ) and not is_splat("office0")
+    assert (
+        is_splat(str(tmp_path))
+        and all(is_splat(f"a{end}") for end in READ)
+        and not is_splat("office0")
+    )
 
 
 def test_the_3d_filter_of_mip_splatting_is_fused_and_said(tmp_path, caplog):

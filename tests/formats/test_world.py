@@ -48,7 +48,9 @@ def test_cameras_and_gaussians_move_with_the_points():
     assert np.allclose(world.poses_inward(outside), pose, atol=1e-6)
 
 
-@pytest.mark.parametrize("world", [HERE, World((0.0, 0.0, 0.0), 1e-4), World((1e6, -7e5, 3.0), 1e-3)])
+@pytest.mark.parametrize(
+    "world", [HERE, World((0.0, 0.0, 0.0), 1e-4), World((1e6, -7e5, 3.0), 1e-3)]
+)
 def test_a_ply_file_has_the_sources_world_and_comes_back_from_it(tmp_path, world):
     parameters = gaussian_parameters()
     write_ply(tmp_path / "a.ply", parameters, 3, world=world)
@@ -59,10 +61,14 @@ def test_a_ply_file_has_the_sources_world_and_comes_back_from_it(tmp_path, world
     for name, values in parameters.items():
         assert np.allclose(read[name], values, atol=2e-6), name
     outside = read_ply(tmp_path / "a.ply")[0]
-    assert np.allclose(np.exp(outside["log_scales"]), world.scale * np.exp(parameters["log_scales"]), rtol=1e-5)
+    assert np.allclose(
+        np.exp(outside["log_scales"]), world.scale * np.exp(parameters["log_scales"]), rtol=1e-5
+    )
 
 
-@pytest.mark.parametrize("notes", [3, {"origin": [1, 2]}, {"scale": 0}, {"scale": "a"}, {"size": 1}, {"origin": None}])
+@pytest.mark.parametrize(
+    "notes", [3, {"origin": [1, 2]}, {"scale": 0}, {"scale": "a"}, {"size": 1}, {"origin": None}]
+)
 def test_a_place_that_is_none_is_refused(notes):
     with pytest.raises(InputError, match="is no place of a scene"):
         World.read({"world": notes})

@@ -35,7 +35,8 @@ from chebsplat.stages.runtime.config import Config
 from malformed.edits import DEEP, Edit, changed, cut, flipped, no_file, put, remove
 from malformed.row import Arguments, Row, stage
 
-N, V, C, FEATURES, SIZE = 40, 3, 5, 7, (24, 16)  # Gaussians, views, channels, of shape, width and height
+# Gaussians, views, channels, of shape, width and height
+N, V, C, FEATURES, SIZE = 40, 3, 5, 7, (24, 16)
 KEY = "0123456789abcdef"
 MEMBER = "data/values.bin"
 VIEWS, LABELS = [f"view_{k}" for k in range(V)], ["wall", "floor", "sofa"]
@@ -59,7 +60,9 @@ def copied(stage: str, folder: Path) -> Path:
 
 
 def fake(path: Path, of: str) -> Path:
-    """An artifact of stage `of` whose manifest is right, with one member that nobody gets as far as to read."""
+    """An artifact of stage `of` whose manifest is right, with one member that nobody gets as far as
+    to read.
+    """
     with artifact.publish(path, Manifest(STAGES[of].schema, KEY, of)) as tmp:
         put(MEMBER, bytes(64))(tmp)
     return path
@@ -83,7 +86,11 @@ Damage = tuple[str, Edit, str]  # what is wrong with an artifact, the edit, a wo
 OF_INPUTS: list[Damage] = [
     ("gone", shutil.rmtree, "artifact.json is missing"),
     ("no manifest", remove("artifact.json"), "artifact.json is missing"),
-    ("a manifest that leads to itself", no_file("artifact.json", "looping link"), "artifact.json is missing"),
+    (
+        "a manifest that leads to itself",
+        no_file("artifact.json", "looping link"),
+        "artifact.json is missing",
+    ),
     ("another schema", manifest(schema="chebsplat.other/9"), "has schema chebsplat.other/9"),
     ("a member gone", remove(MEMBER), "values.bin is missing"),
     ("a member cut short", cut(MEMBER, 1), "has 63 bytes, expected 64"),
@@ -94,13 +101,21 @@ OF_ANY: list[Damage] = [
     ("an empty key", manifest(key=""), "key"),
     ("a key with a line end", manifest(key=KEY + "\n"), "key"),
     ("no key", manifest(key=None), "artifact.json"),
-    ("an input whose key climbs", manifest(inputs={"capture": {"key": "../x", "schema": "s/1"}}), "inputs"),
+    (
+        "an input whose key climbs",
+        manifest(inputs={"capture": {"key": "../x", "schema": "s/1"}}),
+        "inputs",
+    ),
     ("a file that climbs", listed("../in/" + MEMBER), "files"),
     ("an absolute file", listed("/etc/hostname"), "files"),
     ("a file's name with a null byte", listed("data/\0"), "files"),
     ("a file's name too long", listed("x" * 300), "x" * 300),
     ("a manifest that is empty", put("artifact.json", ""), "artifact.json does not parse"),
-    ("a manifest cut short", put("artifact.json", '{"schema": "chebsplat.'), "artifact.json does not parse"),
+    (
+        "a manifest cut short",
+        put("artifact.json", '{"schema": "chebsplat.'),
+        "artifact.json does not parse",
+    ),
     ("a manifest of other bytes", put("artifact.json", b"\xff\xfe\0"), "UTF-8"),
     ("a manifest nested too deeply", put("artifact.json", DEEP), "nested too deeply"),
     ("a manifest that is a list", put("artifact.json", "[]"), "artifact.json"),
@@ -111,7 +126,9 @@ OF_ANY: list[Damage] = [
 ]
 
 
-def met(name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: str = "describe") -> Row:
+def met(
+    name: str, ask: Callable[[Path], Arguments], word: str, edit: Edit, of: str = "describe"
+) -> Row:
     """A damaged artifact in folder/in."""
 
     def build(folder: Path) -> Arguments:
@@ -168,8 +185,12 @@ def splats(what: str, edit: Edit, word: str, alone: bool = False) -> Row:
 
 
 def _publish(path: Path, stage: str, write: Callable[[Path], Any]) -> None:
-    config = Config.model_validate({"describe": DESCRIBED | {"n_regions": 4, "region_size": 8}, "sfm": {}})
-    manifest = Manifest(STAGES[stage].schema, KEY, stage, config=config.sections(("describe", "train")))
+    config = Config.model_validate(
+        {"describe": DESCRIBED | {"n_regions": 4, "region_size": 8}, "sfm": {}}
+    )
+    manifest = Manifest(
+        STAGES[stage].schema, KEY, stage, config=config.sections(("describe", "train"))
+    )
     manifest.facts = {
         "teacher": {"kind": "labels", "n_labels": len(LABELS), "convention": {"confusion": 0.1}},
         "agree": {"agreement": 0.375, "n_points": N},
@@ -189,7 +210,13 @@ def _poses() -> tuple[np.ndarray, np.ndarray]:
 
 def _parameters() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
-    shapes = {"means": (N, 3), "log_scales": (N, 3), "quats": (N, 4), "logit_opacities": (N,), "sh0": (N, 1, 3)}
+    shapes = {
+        "means": (N, 3),
+        "log_scales": (N, 3),
+        "quats": (N, 4),
+        "logit_opacities": (N,),
+        "sh0": (N, 1, 3),
+    }
     shapes["features"] = (N, C)
     p = {name: rng.normal(0, 0.5, shape).astype(np.float32) for name, shape in shapes.items()}
     p["means"][:, 2] += 3
@@ -207,8 +234,13 @@ def _capture(out: Path) -> None:
     depth = np.full((V, height, width), 3, np.float32)
     labels = rng.integers(-1, len(LABELS), (V, height, width)).astype(np.int16)
     is_test = np.arange(V) == 0
-    source, protocol = {"name": "toy", "kind": "generated"}, {"name": "labels", "split": "every third"}
-    Capture(VIEWS, images, Ks, poses, is_test, depth, labels, None, LABELS, source, protocol).write(out)
+    source, protocol = (
+        {"name": "toy", "kind": "generated"},
+        {"name": "labels", "split": "every third"},
+    )
+    Capture(VIEWS, images, Ks, poses, is_test, depth, labels, None, LABELS, source, protocol).write(
+        out
+    )
 
 
 def _points(out: Path) -> None:
@@ -216,7 +248,9 @@ def _points(out: Path) -> None:
     shape = np.tile(np.eye(3, dtype=np.float32), (N, 1, 1))
     means = _parameters()["means"].astype(np.float64)
     tracks = np.zeros((0, 2), np.int32)
-    Points(VIEWS, *_poses(), means, np.zeros((N, 3), np.uint8), normals, shape, tracks, {}).write(out)
+    Points(VIEWS, *_poses(), means, np.zeros((N, 3), np.uint8), normals, shape, tracks, {}).write(
+        out
+    )
 
 
 def _embeddings() -> np.ndarray:
@@ -234,7 +268,9 @@ def _descriptors(out: Path) -> None:
     own, place, values = (np.zeros((N, width), np.float32) for width in (6, 3, 8))
     neighbors = np.full((N, 4, 2), -1, np.int32)
     notes = {"settings": DESCRIBED, "of": "depth"}
-    Descriptors(own, place, place, values, neighbors, [0.0] * 3, [0.0, 0.0, 1.0], 1.0, notes).write(out)
+    Descriptors(own, place, place, values, neighbors, [0.0] * 3, [0.0, 0.0, 1.0], 1.0, notes).write(
+        out
+    )
 
 
 def _encoding(out: Path) -> None:
@@ -255,7 +291,10 @@ def _gaussians(out: Path) -> None:
 
 
 def _agreement(out: Path) -> None:
-    labels = {"wall": {"share": 0.75, "agreement": 0.5}, "floor": {"share": 0.25, "agreement": 0.25}}
+    labels = {
+        "wall": {"share": 0.75, "agreement": 0.5},
+        "floor": {"share": 0.25, "agreement": 0.25},
+    }
     ViewAgreement(0.375, N, V - 1, labels).write(out)
 
 
@@ -263,23 +302,43 @@ def _lifted(out: Path) -> None:
     ones, views = np.ones(N, np.float32), np.full((2, N), 2, np.int32)
     features = np.random.default_rng(3).normal(size=(N, C)).astype(np.float32)
     notes = {"views": VIEWS[1:], "n_observations": 4 * N}
-    Lifted(features, ones, views.sum(0, dtype=np.int32), ones, np.stack([features] * 2), views, notes).write(out)
+    Lifted(
+        features, ones, views.sum(0, dtype=np.int32), ones, np.stack([features] * 2), views, notes
+    ).write(out)
 
 
 def _refined(out: Path) -> None:
     features = np.random.default_rng(4).normal(size=(N, C)).astype(np.float32)
-    notes = {"start": "trained", "smooth": True, "strength": 0.0, "curve": {"off": {"0": 0.8}, "on": {"0": 0.9}}}
+    notes = {
+        "start": "trained",
+        "smooth": True,
+        "strength": 0.0,
+        "curve": {"off": {"0": 0.8}, "on": {"0": 0.9}},
+    }
     Refined(features, np.ones(N, np.float32), notes).write(out)
 
 
 def _knowledge(out: Path) -> None:
-    encoder = {"n_channels": C, "n_descriptors": 0, "n_components": 0, "width": 4, "hidden": 4, "n_scales": 4}
+    encoder = {
+        "n_channels": C,
+        "n_descriptors": 0,
+        "n_components": 0,
+        "width": 4,
+        "hidden": 4,
+        "n_scales": 4,
+    }
     weights = {"embed.0.weight": np.zeros((64, 6), np.float32)}
     describe, card = DescribeSection().model_dump(mode="json"), {"n_rooms": 1}
     matrix = np.eye(C + 2, C, dtype=np.float32)
     words = ["wall"], np.ones((1, C), np.float16)
-    answers = np.ones((FEATURES, C), np.float32), np.eye(FEATURES, 2, dtype=np.float32), np.ones(FEATURES, np.float32)
-    knowledge = Knowledge("tiny", "0" * 64, encoder, weights, matrix, describe, *words, *answers, card)
+    answers = (
+        np.ones((FEATURES, C), np.float32),
+        np.eye(FEATURES, 2, dtype=np.float32),
+        np.ones(FEATURES, np.float32),
+    )
+    knowledge = Knowledge(
+        "tiny", "0" * 64, encoder, weights, matrix, describe, *words, *answers, card
+    )
     write_knowledge(out, knowledge)
 
 
@@ -293,13 +352,31 @@ def _evaluation(out: Path) -> None:
     (width, height), blank = SIZE, np.zeros((1, SIZE[1], SIZE[0], 3), np.uint8)
     sizes = dict.fromkeys(("unpruned_ply", "ply", "split", "ragged", "semantic"), 100)
     whole = {"miou": 0.5, "macc": 0.5, "oa": 0.5, "boundary_miou": None, "iou": {"wall": 0.5}}
-    figures = {"names": VIEWS[:1], "image": {"psnr": 20.0, "ssim": 0.5, "per_view": {"psnr": [20.0], "ssim": [0.5]}}}
+    figures = {
+        "names": VIEWS[:1],
+        "image": {"psnr": 20.0, "ssim": 0.5, "per_view": {"psnr": [20.0], "ssim": [0.5]}},
+    }
     figures["source"] = {"name": "toy", "kind": "generated", "notes": []}
     figures["protocol"] = {"name": "labels", "split": "every third", "resolution": "32x24"}
-    figures |= {"n_gaussians": N, "bytes": sizes, "frames_per_second": {}, "milliseconds": {}, "lpips": None}
-    figures |= {"left_out": {}, "segmentation": {"classes": LABELS, "scene": whole, "teacher": whole}}
+    figures |= {
+        "n_gaussians": N,
+        "bytes": sizes,
+        "frames_per_second": {},
+        "milliseconds": {},
+        "lpips": None,
+    }
+    figures |= {
+        "left_out": {},
+        "segmentation": {"classes": LABELS, "scene": whole, "teacher": whole},
+    }
     labels = np.zeros((1, height, width), np.int16)
-    pictures = {"truth": blank, "renders": blank, "labels": labels, "predicted": labels, "teacher": labels}
+    pictures = {
+        "truth": blank,
+        "renders": blank,
+        "labels": labels,
+        "predicted": labels,
+        "teacher": labels,
+    }
     Evaluation(figures, pictures).write(out)
 
 

@@ -1,4 +1,6 @@
-"""Settings, documents, names and places that no command could use, and a work folder that is none or damaged."""
+"""Settings, documents, names and places that no command could use, and a work folder that is none
+or damaged.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from malformed.edits import DEEP, Edit, no_file, put, swollen
 from malformed.row import Arguments, Row, stage
 
 LONG = "x" * 300
-SETTINGS: list[tuple[str, object, str]] = [  # a setting of a config, its value, a word of the message beside its name
+# a setting of a config, its value, a word of the message beside its name
+SETTINGS: list[tuple[str, object, str]] = [
     ("scene.name", "a\nb", "scene.name"),
     ("source.kind", "coLmap", "colmap"),
     ("source.seed", 2**64, "source.seed"),
@@ -65,16 +68,25 @@ STUDIES: list[tuple[str, str, str]] = [  # what is wrong, the text, what stderr 
     ("another baseline", STUDY.replace('"a"', '"b"') + "[variants.a]\n", "variants"),
     ("no seeds", STUDY + "seeds = []\n[variants.a]\n", "seeds"),
     ("infinite seconds", STUDY + "budgets.seconds = [inf]\n[variants.a]\n", "budgets.seconds"),
-    ("a section that is a number", STUDY + "settings = { train = 5 }\n[variants.a]\n", "settings.train"),
+    (
+        "a section that is a number",
+        STUDY + "settings = { train = 5 }\n[variants.a]\n",
+        "settings.train",
+    ),
     ("no scenes", STUDY.replace('"toy"', "") + "[variants.a]\n", "scenes"),
     ("an ablation that is a number", STUDY + "[variants.a]\nablation = 5\n", "variants.a.ablation"),
-    ("a condition that is a number", STUDY + "conditions = { x = 5 }\n[variants.a]\n", "conditions.x"),
+    (
+        "a condition that is a number",
+        STUDY + "conditions = { x = 5 }\n[variants.a]\n",
+        "conditions.x",
+    ),
     ("a setting out of range", STUDY + "[variants.a.train]\nwidth = 100000\n", "train.width"),
     ("an unknown setting", STUDY + "[variants.a.train]\nwitdh = 32\n", "train.witdh"),
     ("an unknown ablation", STUDY + '[variants.a]\nablation = "no-tel"\n', "no-tel"),
     ("an unknown scene", STUDY.replace("toy", "tyo") + "[variants.a]\n", "tyo"),
 ]
-SEQUENCES = ["[scenes", "", "scenes = []", 'scenes = "toy"', "scenes = [1, 2]", 'scenes = ["toy", ""]',
+SEQUENCES = ["[scenes", "", "scenes = []", 'scenes = "toy"', "scenes = [1, 2]", 'scenes = ["toy", '
+                                                                                '""]',
              'scenes = ["to\\ny"]', 'scenes = ["toy"]\nsteps = 5', "scenes = [" + '"toy",' * 2000 + "]"]  # fmt: skip
 NAMES: list[tuple[str, str, int]] = [  # a command's words, what it must name, its exit code
     ("run", "scene=", 2),
@@ -121,7 +133,9 @@ NAMES: list[tuple[str, str, int]] = [  # a command's words, what it must name, i
 ]
 
 
-def words(kind: str, arguments: Sequence[str], *named: str, code: int = 2, edit: Edit | None = None) -> Row:
+def words(
+    kind: str, arguments: Sequence[str], *named: str, code: int = 2, edit: Edit | None = None
+) -> Row:
     """A command met in a folder with a file named `file`, and what `edit` puts there."""
 
     def build(folder: Path) -> Arguments:
@@ -138,7 +152,9 @@ def settings() -> Iterator[Row]:
     for setting, value, word in SETTINGS:
         section, key = setting.split(".")
 
-        def build(folder: Path, section: str = section, key: str = key, value: object = value) -> Arguments:
+        def build(
+            folder: Path, section: str = section, key: str = key, value: object = value
+        ) -> Arguments:
             return stage("sfm", folder, {section: {key: value}}, capture=folder / "none")
 
         yield Row("setting", f"{setting} = {value!r:.30}", build, (word,), 2)
@@ -160,7 +176,18 @@ def documents() -> Iterator[Row]:
         asked: Callable[[Path], list[str | Path]] = {
             "study": lambda folder: ["study", folder / name, "--plan"],
             "sequence": lambda folder: ["plan", "--sequence", folder / name],
-        }.get(kind, lambda folder: ["sfm", "--config", folder / name, "--out", folder / "out", "--in-capture", folder])
+        }.get(
+            kind,
+            lambda folder: [
+                "sfm",
+                "--config",
+                folder / name,
+                "--out",
+                folder / "out",
+                "--in-capture",
+                folder,
+            ],
+        )
 
         def build(folder: Path) -> Arguments:
             edit(folder)
@@ -213,12 +240,17 @@ def with_a_note(place: Path) -> None:
     (place / "thesis.tex").write_text("years")
 
 
-PLACES: dict[str, tuple[Callable[[Path], object], str, int]] = {  # what stands where, and the exit code
+# what stands where, and the exit code
+PLACES: dict[str, tuple[Callable[[Path], object], str, int]] = {
     "a file": (lambda place: place.write_text("years"), "mine", 3),
     "a folder of the user's": (users, "mine", 3),
     "a folder with an artifact.json": (with_a_manifest, "mine", 3),
     "another stage's artifact": (lambda place: fake(place, "train"), "mine", 3),
-    "a link to an artifact": (lambda place: place.symlink_to(fake(place.with_name("other"), "ingest")), "mine", 3),
+    "a link to an artifact": (
+        lambda place: place.symlink_to(fake(place.with_name("other"), "ingest")),
+        "mine",
+        3,
+    ),
     "a link that leads nowhere": (lambda place: place.symlink_to("nothing"), "mine", 3),
     "a link that leads to itself": (lambda place: place.symlink_to(place.name), "mine", 3),
     "below a file": (lambda place: place.parents[1].write_text("years"), "mine/x/y", 2),
@@ -239,7 +271,9 @@ def places() -> Iterator[Row]:
             if what == "a link to an artifact" and not force:
                 continue  # it is whole: there is nothing to do
 
-            def build(folder: Path, stands=stands, place: str = place, force: bool = force) -> Arguments:  # type: ignore[no-untyped-def]
+            def build(
+                folder: Path, stands=stands, place: str = place, force: bool = force
+            ) -> Arguments:  # type: ignore[no-untyped-def]
                 stands(folder / place)
                 arguments = ingest(folder)
                 arguments[arguments.index("--out") + 1] = folder / place
@@ -253,7 +287,12 @@ def places() -> Iterator[Row]:
         with_a_note(folder / "out")
         return [*ingest(folder), "--force"]
 
-    yield Row("--out", "an artifact with a note in it, --force", noted, ("thesis.tex", "no part of the artifact"))
+    yield Row(
+        "--out",
+        "an artifact with a note in it, --force",
+        noted,
+        ("thesis.tex", "no part of the artifact"),
+    )
 
 
 # What lies in work
@@ -292,16 +331,41 @@ def work() -> Iterator[Row]:
         linked(folder / "work", "toy", "train")
 
     for line in ("verify toy", "rm toy", "clean-stale", "clean-stale --yes"):
-        yield words("work, a manifest cut short", line.split(), "artifact.json", "does not parse", code=3, edit=damaged)
-    for what, text in (("cut short", "{"), ("of another kind", '{"steps": [3]}'), ("a folder", None)):
-        yield words(f"work, a plan {what}", ["clean-stale", "--yes"], "plan.json", code=3, edit=plan_under_way(text))
+        yield words(
+            "work, a manifest cut short",
+            line.split(),
+            "artifact.json",
+            "does not parse",
+            code=3,
+            edit=damaged,
+        )
+    for what, text in (
+        ("cut short", "{"),
+        ("of another kind", '{"steps": [3]}'),
+        ("a folder", None),
+    ):
+        yield words(
+            f"work, a plan {what}",
+            ["clean-stale", "--yes"],
+            "plan.json",
+            code=3,
+            edit=plan_under_way(text),
+        )
     yield words("work, several settings", ["verify", "toy"], "toy@train.steps=5", edit=several)
     yield words("work, unfinished", ["extract", "toy", "--out", "x.ply"], "export", edit=unfinished)
     yield words("work, unfinished", ["query", "toy", "sofa"], "export", edit=unfinished)
     yield words("work, a file", ["run", "--scene", "toy"], "work", edit=put("work", "a file"))
     photo = put("images/a.jpg", "")
-    yield words("work, photos not run yet", ["query", "./images", "sofa"], "make scene=./images", code=3, edit=photo)
-    yield words("work, photos", ["extract", "images", "--out", "x.ply"], "images", code=3, edit=photo)
+    yield words(
+        "work, photos not run yet",
+        ["query", "./images", "sofa"],
+        "make scene=./images",
+        code=3,
+        edit=photo,
+    )
+    yield words(
+        "work, photos", ["extract", "images", "--out", "x.ply"], "images", code=3, edit=photo
+    )
     yield words("work, links elsewhere", ["rm", "./mine", "--yes"], "mine", code=3,
                 edit=lambda folder: linked(folder, "mine", "train"))  # fmt: skip
 

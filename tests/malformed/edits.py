@@ -19,7 +19,10 @@ from PIL import Image
 Edit = Callable[[Path], Any]
 DEEP = "[" * 50_000
 NO_FILES = ("pipe", "device", "folder", "dangling link", "looping link")
-EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 6\n%%EndComments\n0 0 moveto 8 6 lineto stroke\nshowpage\n"
+EPS = (
+    b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 6\n%%EndComments\n0 0 moveto 8 6 lineto "
+    b"stroke\nshowpage\n"
+)
 
 
 def put(place: str, content: str | bytes) -> Edit:
@@ -73,7 +76,13 @@ def no_file(place: str, kind: str) -> Edit:
         elif kind == "folder":
             path.mkdir()
         else:
-            path.symlink_to(Path("/dev/zero") if kind == "device" else path if kind == "looping link" else source / "-")
+            path.symlink_to(
+                Path("/dev/zero")
+                if kind == "device"
+                else path
+                if kind == "looping link"
+                else source / "-"
+            )
 
     return edit
 
@@ -93,7 +102,9 @@ def keys(place: str, **values: Any) -> Edit:
     return changed(place, lambda document: document | values)
 
 
-def picture(place: str, size: tuple[int, int] = (8, 6), mode: str = "RGB", form: str = "PNG") -> Edit:
+def picture(
+    place: str, size: tuple[int, int] = (8, 6), mode: str = "RGB", form: str = "PNG"
+) -> Edit:
     """An image of any format, whatever its name."""
 
     def edit(source: Path) -> None:
@@ -108,11 +119,15 @@ def declared_png(width: int, height: int, color: int = 2) -> bytes:
     """A PNG that says how large it is and holds a few rows of nothing."""
 
     def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        return (
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        )
 
     start = struct.pack(">IIBBBBB", width, height, 8, color, 0, 0, 0)
     pixels = zlib.compress(bytes(1 << 16))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", start) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", start) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+    )
 
 
 def npy(array: np.ndarray, **header: Any) -> bytes:

@@ -1,4 +1,6 @@
-"""A row of the table: what is damaged how, the command that meets it, and what the command must answer."""
+"""A row of the table: what is damaged how, the command that meets it, and what the command must
+answer.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +32,10 @@ Arguments = Sequence[str | Path]
 class Row:
     """A malformed input and the answer to it.
 
-    kind: the folder or file that is damaged; name: how; build: writes it below an empty folder and gives the arguments
-    of `chebsplat`; words: what stderr must hold, the name of the file or setting among them; alone: in a process of its
-    own, as whatever may block or eat memory.
+    kind: the folder or file that is damaged; name: how; build: writes it below an empty folder and
+      gives the arguments
+    of `chebsplat`; words: what stderr must hold, the name of the file or setting among them; alone:
+    in a process of its own, as whatever may block or eat memory.
     """
 
     kind: str
@@ -60,7 +63,15 @@ def stage(name: str, folder: Path, config: Mapping[str, Any], **inputs: Path) ->
     """Arguments of a stage's own command on a config and input artifacts."""
     file = folder / "config.json"
     file.write_text(json.dumps(config))
-    arguments: list[str | Path] = [name, "--config", file, "--out", folder / "out", "--device", "cpu"]
+    arguments: list[str | Path] = [
+        name,
+        "--config",
+        file,
+        "--out",
+        folder / "out",
+        "--device",
+        "cpu",
+    ]
     for role, path in inputs.items():
         arguments += [f"--in-{role}", path]
     return arguments
@@ -104,13 +115,17 @@ def run_alone(arguments: Arguments, folder: Path, seconds: float = SECONDS) -> A
 
 
 def _watch(process: subprocess.Popen[bytes], peak: list[int]) -> None:
-    """The high-water mark of a process' resident memory; one beyond BYTES is killed before it hurts others."""
+    """The high-water mark of a process' resident memory; one beyond BYTES is killed before it hurts
+    others.
+    """
     while process.poll() is None:
         try:
             status = Path(f"/proc/{process.pid}/status").read_text()
         except OSError:
             return
-        marks = [int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM")]
+        marks = [
+            int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM")
+        ]
         peak[0] = max(peak[0], *marks, 0)
         if peak[0] > BYTES:
             process.kill()
@@ -118,13 +133,21 @@ def _watch(process: subprocess.Popen[bytes], peak: list[int]) -> None:
 
 
 def state_of(folder: Path) -> dict[Path, tuple[int, int]]:
-    """Size and time of every file, but for what a planner remembers: no refused command changes them."""
+    """Size and time of every file, but for what a planner remembers: no refused command changes
+    them.
+    """
     found = (path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
-    return {path: (path.lstat().st_size, path.lstat().st_mtime_ns) for path in found if ".cache" not in path.parts}
+    return {
+        path: (path.lstat().st_size, path.lstat().st_mtime_ns)
+        for path in found
+        if ".cache" not in path.parts
+    }
 
 
 def fault_of(row: Row, answer: Answer, changed: bool) -> str:
-    """What is wrong with an answer; empty if nothing is. changed: the files below the folder are others than before."""
+    """What is wrong with an answer; empty if nothing is. changed: the files below the folder are
+    others than before.
+    """
     if answer.peak > BYTES:
         return f"took {answer.peak / 2**20:.0f} MiB"
     if answer.code is None:

@@ -1,4 +1,6 @@
-"""Folders of photos and data sets that nothing could be made of, met by the ingest stage, some by `plan`."""
+"""Folders of photos and data sets that nothing could be made of, met by the ingest stage, some by
+`plan`.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ from malformed.edits import (
 from malformed.row import Arguments, Row, stage
 
 NAN, INF = float("nan"), float("inf")
-# the file or setting that is named, what is wrong with it, the edit or the file's content, a word of the message
+# the file or setting that is named, what is wrong with it, the edit or the file's content, a word
+# of the message
 Case = tuple[str, str, Edit | str | bytes, str]
 
 
@@ -46,7 +49,9 @@ def met(
     plan: bool = False,
     **settings: Any,
 ) -> Iterator[Row]:
-    """Each case of a folder that `write` makes, met by ingest, or by `plan`; alone: in a process of its own."""
+    """Each case of a folder that `write` makes, met by ingest, or by `plan`; alone: in a process of
+    its own.
+    """
     kind, (_, layout, _) = next((kind, whole) for kind, whole in WHOLE.items() if whole[0] is write)
     for named, what, edit, word in cases:
 
@@ -60,7 +65,9 @@ def met(
             section = {"kind": layout, "path": str(source)}
             if layout == "photos":  # which come alone: ingest has no model of them yet
                 return stage("pose", folder, {"source": section})
-            return stage("ingest", folder, {"source": section, "ingest": {"min_views": 2} | settings})
+            return stage(
+                "ingest", folder, {"source": section, "ingest": {"min_views": 2} | settings}
+            )
 
         yield Row(kind, f"{named}: {what}{', in plan' * plan}", build, (named, word), code, alone)
 
@@ -89,7 +96,9 @@ def called_by(raw: bytes) -> Edit:
 
 def instead(*names: str) -> Edit:
     """Other files where the photos were."""
-    return all_of(*map(remove, ("a.jpg", "b.jpg", "c.png")), *(put(name, b"\0" * 64) for name in names))
+    return all_of(
+        *map(remove, ("a.jpg", "b.jpg", "c.png")), *(put(name, b"\0" * 64) for name in names)
+    )
 
 
 def photos() -> Iterator[Row]:
@@ -113,7 +122,9 @@ def photos() -> Iterator[Row]:
     yield from met(write_photos, alone, 4)
     bombs = {"10,000 million pixels": (100_000, 100_000), "177 million pixels": (13_300, 13_300),
              "2^31 columns": (2**31 - 1, 1)}  # fmt: skip
-    heavy: list[Case] = [("b.jpg", what, declared_png(*size), "too large") for what, size in bombs.items()]
+    heavy: list[Case] = [
+        ("b.jpg", what, declared_png(*size), "too large") for what, size in bombs.items()
+    ]
     heavy.append(("b.jpg", "rows that it has not", declared_png(4000, 4000), BROKEN))
     heavy.append(("b.jpg", "a terabyte", all_of(put("b.jpg", ""), swollen("b.jpg")), NO_IMAGE))
     heavy += [("b.jpg", f"a {kind}", no_file("b.jpg", kind), "a pipe, a socket or a device")
@@ -123,13 +134,20 @@ def photos() -> Iterator[Row]:
     others: list[Case] = [(f"1 .{end.lower()}", "alone", instead(f"a.{end}"), f"a.{end.lower()}")
                           for end in ("avif", "tif", "CR2")]  # fmt: skip
     others.append(("2 .mov", "alone", instead("a.MOV", "b.MOV"), "a video is read by itself"))
-    yield from met(write_photos, [*others, ("scene", "nothing", instead(), "is no source")], plan=True)
+    yield from met(
+        write_photos, [*others, ("scene", "nothing", instead(), "is no source")], plan=True
+    )
 
 
 def companions() -> Iterator[Row]:
     one = all_of(remove("images/a.png"), remove("images/b.png"))
     yield from met(write_companions, [("ingest.min_views", "one photo", one, "1 usable frames")], 4)
-    yield from met(write_companions, [("ingest.test_every", "all are test views", one, "all of them")], 4, min_views=1)
+    yield from met(
+        write_companions,
+        [("ingest.test_every", "all are test views", one, "all of them")],
+        4,
+        min_views=1,
+    )
     none = ("ingest.test_offset", "no test view", put("d.txt", ""), "none of them")
     yield from met(write_companions, [none], 4, test_offset=7)
     cases: list[Case] = []
@@ -147,7 +165,12 @@ def companions() -> Iterator[Row]:
         (depth, "8 bits", picture(depth, mode="L"), "16-bit depth"),
         (depth, "coloured", picture(depth), "16-bit depth"),
         (labels, "of a photo", picture(labels, form="JPEG"), "is a JPEG picture"),
-        (labels, "an array beside it", put("semantic/b.npy", npy(np.zeros((6, 8), np.uint8))), "are both view"),
+        (
+            labels,
+            "an array beside it",
+            put("semantic/b.npy", npy(np.zeros((6, 8), np.uint8))),
+            "are both view",
+        ),
         ("semantic/", "one is coloured", picture(labels), "several kinds: colours (b), ids (a, c)"),
         (
             "semantic/",
@@ -158,14 +181,29 @@ def companions() -> Iterator[Row]:
         *(
             (path, what, all_of(remove(labels), put(path, npy(values))), word)
             for path, what, values, word in (
-                ("semantic/b.npy", "of a photo's transpose", np.zeros((8, 6), np.uint8), "is 6x8, its photo 8x6"),
+                (
+                    "semantic/b.npy",
+                    "of a photo's transpose",
+                    np.zeros((8, 6), np.uint8),
+                    "is 6x8, its photo 8x6",
+                ),
                 ("semantic/b.npy", "halves", np.full((6, 8), 0.5), "no ids"),
                 ("semantic/b.npy", "nan", np.full((6, 8), NAN), "not finite"),
-                ("semantic/b.npy", "scores of another shape", np.zeros((4, 4, 4)), "has not the shape"),
+                (
+                    "semantic/b.npy",
+                    "scores of another shape",
+                    np.zeros((4, 4, 4)),
+                    "has not the shape",
+                ),
                 ("semantic/b.npy", "words", np.array(["sofa"]), "neither ids nor scores"),
             )
         ),
-        ("semantic/b.npy", "cut short", all_of(remove(labels), put("semantic/b.npy", b"\x93NUMPY")), "not a readable"),
+        (
+            "semantic/b.npy",
+            "cut short",
+            all_of(remove(labels), put("semantic/b.npy", b"\x93NUMPY")),
+            "not a readable",
+        ),
     ]
     yield from met(write_companions, cases)
     heavy: list[Case] = [(f"{place}/b.png", "10,000 million pixels", declared_png(100_000, 100_000, 0), "too large")
@@ -176,7 +214,8 @@ def companions() -> Iterator[Row]:
     yield from met(write_companions, [
         ("masks/a.png", "all are black", black, "no pixel of any view counts"),
         ("images/a.png", "all are transparent", clear, "no pixel of any view counts"),
-        ("ids [7]", "no label has a name", put("labels.json", '{"3": "sofa"}'), "no label has a name"),
+        ("ids [7]", "no label has a name", put("labels.json", '{"3": "sofa"}'), "no label has a "
+                                                                                "name"),
     ], 4)  # fmt: skip
 
 
@@ -187,7 +226,9 @@ MODEL = "sparse/0"
 NAMES = (b"a.png", b"b.png", b"c.png")
 
 
-def camera(kind: int = PINHOLE, size: tuple[int, int] = (8, 6), params: tuple[float, ...] = (10, 10, 4, 3)) -> bytes:
+def camera(
+    kind: int = PINHOLE, size: tuple[int, int] = (8, 6), params: tuple[float, ...] = (10, 10, 4, 3)
+) -> bytes:
     return struct.pack(f"<QIiQQ{len(params)}d", 1, 1, kind, *size, *params)
 
 
@@ -212,8 +253,16 @@ def points(n_tracks: int = 1) -> bytes:
     return struct.pack("<QQ3d3BdQII", 1, 1, 0, 0, 2, 9, 9, 9, 0.5, n_tracks, 1, 0)
 
 
-PARTS = {f"{MODEL}/cameras.bin": camera(), f"{MODEL}/images.bin": views(), f"{MODEL}/points3D.bin": points()}
-NO_MODEL, NO_CAMERA, NO_POSE = "cut or no COLMAP model", "is not usable", "no rotation and translation"
+PARTS = {
+    f"{MODEL}/cameras.bin": camera(),
+    f"{MODEL}/images.bin": views(),
+    f"{MODEL}/points3D.bin": points(),
+}
+NO_MODEL, NO_CAMERA, NO_POSE = (
+    "cut or no COLMAP model",
+    "is not usable",
+    ("no rotation and translation"),
+)
 
 
 def write_model(source: Path) -> None:
@@ -249,14 +298,28 @@ def colmap() -> Iterator[Row]:
         (images, "a name without an end", views()[:72] + b"a" * 10**6, NO_MODEL),
         (cloud, "missing", remove(cloud), "is missing"),
         (cloud, "a track of 2^40", points(2**40), NO_MODEL),
-        ("images/a.png", "another size", put(cameras, camera(size=(80, 66), params=(100, 100, 40, 30))), "80x66"),
+        (
+            "images/a.png",
+            "another size",
+            put(cameras, camera(size=(80, 66), params=(100, 100, 40, 30))),
+            "80x66",
+        ),
     ]
     yield from met(write_model, cases)
-    outside = {"climb out": b"../../../etc/x.png", "are absolute": b"/etc/x.png", "are no UTF-8": b"\xff"}
-    few: list[Case] = [("ingest.min_views", f"names that {what}", put(images, views((name,) * 3)), "absent on disk")
+    outside = {
+        "climb out": b"../../../etc/x.png",
+        "are absolute": b"/etc/x.png",
+        "are no UTF-8": b"\xff",
+    }
+    few: list[Case] = [("ingest.min_views", f"names that {what}", put(images, views((name,) * 3)), "absent on "
+                                                                                                   ""
+                                                                                                   ""
+                                                                                                   "disk")
                        for what, name in outside.items()]  # fmt: skip
     yield from met(write_model, few, 4)
-    heavy: list[Case] = [(place, "a terabyte", swollen(place), "more than 512 MiB") for place in PARTS]
+    heavy: list[Case] = [
+        (place, "a terabyte", swollen(place), "more than 512 MiB") for place in PARTS
+    ]
     heavy.append((images, "a pipe", no_file(images, "pipe"), "a pipe"))
     yield from met(write_model, heavy, alone=True)
     gone = (MODEL, "no model", all_of(*map(remove, PARTS)), "holds no COLMAP model")
@@ -268,19 +331,27 @@ def colmap() -> Iterator[Row]:
                       (f"1 PINHOLE {'9' * 5000} 6 10 10 4 3", NO_MODEL)):  # fmt: skip
         as_text.append((f"{MODEL}/cameras.txt", row[:24], f"{row}\n", word))
     kept = "1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.png\n\n"
-    for row, word in (("3 nan 0 0 0 2 0 0 1 c.png", NO_POSE), ("3 1 0 0 0 2 0 0 1", "line 5 is neither"),
+    for row, word in (("3 nan 0 0 0 2 0 0 1 c.png", NO_POSE), ("3 1 0 0 0 2 0 0 1", "line 5 is "
+                                                                                    "neither"),
                       ("3 1 0 0 0 2 0 0 1 c.png\n4 5 -1 6 7 -1 8", "line 6 is neither"),
                       ("3 1 0 0 0 2 0 0 1 c.png\n4 5 -1 6 7 -1 8 9 -1 4", "line 6 is neither")):  # fmt: skip
         as_text.append((f"{MODEL}/images.txt", row, f"{kept}{row}\n", word))
-    as_text.append((f"{MODEL}/points3D.txt", "half a track", "1 0 0 2 9 9 9 .5 1 0 2\n", "a point of 11 words"))
-    as_text.append((f"{MODEL}/cameras.txt", "half a pixel", "1 PINHOLE 8.5 6 10 10 4 3\n", "no whole number"))
+    as_text.append(
+        (f"{MODEL}/points3D.txt", "half a track", "1 0 0 2 9 9 9 .5 1 0 2\n", "a point of 11 words")
+    )
+    as_text.append(
+        (f"{MODEL}/cameras.txt", "half a pixel", "1 PINHOLE 8.5 6 10 10 4 3\n", "no whole number")
+    )
     as_text += [("scene.json", f"test_every = {value!r}", keys("scene.json", test_every=value), "test_every")
                 for value in (True, 0, "8")]  # fmt: skip
     as_text += [("scene.json", f"frames = {value!r}", keys("scene.json", test_every=8, frames=value), "frames")
                 for value in (3, [{"file": 3}])]  # fmt: skip
     as_text += [("scene.json", f"labels = {value!r}", keys("scene.json", labels=value), "label")
                 for value in ([], {"7": " "}, {"7": ["sofa"]})]  # fmt: skip
-    as_text += [("labels.json", f"an id of {key[:9]!r}", f'{{"{key}": "sofa"}}', "a label's id is not usable")
+    as_text += [("labels.json", f"an id of {key[:9]!r}", f'{{"{key}": "sofa"}}', "a label's id is not "
+                                                                                 ""
+                                                                                 ""
+                                                                                 "usable")
                 for key in ("-1", "65536", "9" * 5000)]  # fmt: skip
     yield from met(write_colmap, as_text)
 
@@ -288,7 +359,12 @@ def colmap() -> Iterator[Row]:
 # transforms.json
 
 FILE = "transforms.json"
-NO_NUMBERS, ELSEWHERE, RIGID, FAR = "no numbers", "lies elsewhere", "is not a rotation", "units from the origin"
+NO_NUMBERS, ELSEWHERE, RIGID, FAR = (
+    "no numbers",
+    "lies elsewhere",
+    "is not a rotation",
+    ("units from the origin"),
+)
 
 
 def frame(**values: Any) -> Edit:
@@ -324,8 +400,13 @@ def transforms() -> Iterator[Row]:
         (FILE, "a list", "[]", "holds a list"),
         (FILE, "nested lists", DEEP, "nested too deeply"),
     ]
-    cases += [(FILE, f"frames = {value}", keys(FILE, frames=value), "no frames") for value in (None, [], "a")]
-    cases += [(FILE, f"frames = {value}", keys(FILE, frames=value), "a frame") for value in ([3], [{}])]
+    cases += [
+        (FILE, f"frames = {value}", keys(FILE, frames=value), "no frames")
+        for value in (None, [], "a")
+    ]
+    cases += [
+        (FILE, f"frames = {value}", keys(FILE, frames=value), "a frame") for value in ([3], [{}])
+    ]
     for what, matrix, word in (
         ("null", None, "does not hold numbers"),
         ("3 columns", np.eye(3).tolist(), "is (3, 3)"),
@@ -344,27 +425,62 @@ def transforms() -> Iterator[Row]:
     }
     cases += [(FILE, f"{key} = {json.dumps(value)[:20]}", keys(FILE, **{key: value}), word)
               for word, given in numbers.items() for key, values in given.items() for value in values]  # fmt: skip
-    cases += [(FILE, f"camera_angle_x = {text}", by_angle(text), NO_NUMBERS) for text in ("0", "1e400", "3.2")]
+    cases += [
+        (FILE, f"camera_angle_x = {text}", by_angle(text), NO_NUMBERS)
+        for text in ("0", "1e400", "3.2")
+    ]
     paths = {"climbs": "../../etc/hostname", "is absolute": "/etc/x.png", "climbs late": "images/../../x.png",
              "climbs by backslashes": "..\\..\\x.png"}  # fmt: skip
-    cases += [(FILE, f"a path that {what}", frame(file_path=path), ELSEWHERE) for what, path in paths.items()]
+    cases += [
+        (FILE, f"a path that {what}", frame(file_path=path), ELSEWHERE)
+        for what, path in paths.items()
+    ]
     cases += [
         (FILE, "a path that is a list", frame(file_path=["a.png"]), "no object with paths as text"),
         (FILE, "mask_path climbs out", frame(mask_path="../../x.png"), ELSEWHERE),
-        (FILE, "depth_file_path is a number", frame(depth_file_path=1), "no object with paths as text"),
-        (FILE, "no focal length", changed(FILE, lambda d: d.pop("fl_x") and None), "camera_angle_x"),
+        (
+            FILE,
+            "depth_file_path is a number",
+            frame(depth_file_path=1),
+            "no object with paths as text",
+        ),
+        (
+            FILE,
+            "no focal length",
+            changed(FILE, lambda d: d.pop("fl_x") and None),
+            "camera_angle_x",
+        ),
         ("masks/x.png", "missing", frame(mask_path="masks/x.png"), "is missing"),
         ("images/frame_9.png", "another size than w", keys(FILE, w=9), "its camera 9x6"),
-        ("images/frame_9.png", "listed twice", frame(file_path="images/frame_9.png"), "are both view frame_9"),
+        (
+            "images/frame_9.png",
+            "listed twice",
+            frame(file_path="images/frame_9.png"),
+            "are both view frame_9",
+        ),
     ]
     yield from met(write_transforms, cases)
     few: list[Case] = [
-        ("ingest.min_views", "poses of inf", frames(lambda f: {"transform_matrix": [[INF] * 4] * 4}), "not finite"),
-        ("ingest.min_views", "no photo", frames(lambda f: {"file_path": f["file_path"] + "x"}), "3 listed frames"),
+        (
+            "ingest.min_views",
+            "poses of inf",
+            frames(lambda f: {"transform_matrix": [[INF] * 4] * 4}),
+            "not finite",
+        ),
+        (
+            "ingest.min_views",
+            "no photo",
+            frames(lambda f: {"file_path": f["file_path"] + "x"}),
+            "3 listed frames",
+        ),
     ]
     yield from met(write_transforms, few, 4)
-    heavy: list[Case] = [(FILE, f"a {kind}", no_file(FILE, kind), "a device") for kind in ("pipe", "device")]
-    yield from met(write_transforms, [*heavy, (FILE, "a terabyte", swollen(FILE), "are read")], alone=True)
+    heavy: list[Case] = [
+        (FILE, f"a {kind}", no_file(FILE, kind), "a device") for kind in ("pipe", "device")
+    ]
+    yield from met(
+        write_transforms, [*heavy, (FILE, "a terabyte", swollen(FILE), "are read")], alone=True
+    )
     climbs = (FILE, "a path climbs", frame(file_path="../x"), ELSEWHERE)
     yield from met(write_transforms, [(FILE, "nested lists", DEEP, "nested"), climbs], plan=True)
 
@@ -384,12 +500,27 @@ def replica() -> Iterator[Row]:
     cases: list[Case] = [
         (TRAJECTORY, "a row too few", two, "2 poses for 3 images"),
         (TRAJECTORY, "words", "a\nb\nc\n", "row 1 does not hold 16 numbers"),
-        (TRAJECTORY, "15 numbers", two + POSE[:-3].format(0) + "\n", "row 3 does not hold 16 numbers"),
+        (
+            TRAJECTORY,
+            "15 numbers",
+            two + POSE[:-3].format(0) + "\n",
+            "row 3 does not hold 16 numbers",
+        ),
         (TRAJECTORY, "1e30 away", two + POSE.format(1e30), FAR),
-        (TRAJECTORY, "twice the size", two + POSE.format(0).replace("1", "2"), "frame000002 is not a rotation"),
+        (
+            TRAJECTORY,
+            "twice the size",
+            two + POSE.format(0).replace("1", "2"),
+            "frame000002 is not a rotation",
+        ),
         (TRAJECTORY, "missing", remove(TRAJECTORY), "is missing"),
         (TRAJECTORY, "a frame is missing", lost, "3 poses for 2 images"),
-        (TRAJECTORY, "a frame and a row are missing", all_of(lost, put(TRAJECTORY, two)), "image 1 is missing"),
+        (
+            TRAJECTORY,
+            "a frame and a row are missing",
+            all_of(lost, put(TRAJECTORY, two)),
+            "image 1 is missing",
+        ),
         ("results/depth000001.png", "missing", remove("results/depth000001.png"), "is missing"),
         ("scene", "no results", remove("results"), "neither results/"),
         (CAMERA, "missing", remove(CAMERA), "is missing"),
@@ -403,23 +534,38 @@ def replica() -> Iterator[Row]:
     }
     for word, given in values.items():
         for key, value in ((key, value) for key, each in given.items() for value in each):
-            change = changed(CAMERA, lambda d, key=key, value=value: d["camera"].update({key: value}))
+            change = changed(
+                CAMERA, lambda d, key=key, value=value: d["camera"].update({key: value})
+            )
             cases.append((CAMERA, f"{key} = {value!r}", change, word))
     yield from met(write_slam, cases)
     nowhere = put(TRAJECTORY, POSE.format("nan") * 3)
     yield from met(write_slam, [("ingest.min_views", "poses of nan", nowhere, "not finite")], 4)
-    yield from met(write_slam, [(TRAJECTORY, "a terabyte", swollen(TRAJECTORY), "are read")], alone=True)
+    yield from met(
+        write_slam, [(TRAJECTORY, "a terabyte", swollen(TRAJECTORY), "are read")], alone=True
+    )
     cases = [(CLASSES, text, text, "lacks classes with id and name")
              for text in ("{}", '{"classes": 3}', '{"classes": ["a"]}')]  # fmt: skip
     for value in (-1, True, 70_000):
         entry = {"id": value, "name": "a"}
-        cases.append((CLASSES, f"an id of {value}", keys(CLASSES, classes=[entry]), "a label's id is not usable"))
-    cases.append((CLASSES, "no name", keys(CLASSES, classes=[{"id": 1, "name": ""}]), "label 1 has ''"))
+        cases.append(
+            (
+                CLASSES,
+                f"an id of {value}",
+                keys(CLASSES, classes=[entry]),
+                "a label's id is not usable",
+            )
+        )
+    cases.append(
+        (CLASSES, "no name", keys(CLASSES, classes=[{"id": 1, "name": ""}]), "label 1 has ''")
+    )
     for name in ("traj_w_c.txt", "depth/depth_2.png"):
         cases.append((f"Sequence_1/{name}", "missing", remove(f"Sequence_1/{name}"), "is missing"))
     yield from met(write_nerf, cases)
     strangers = keys(CLASSES, classes=[{"id": 9, "name": "wall"}])
-    yield from met(write_nerf, [("ids [0, 1, 2]", "no label has a name", strangers, "no label has a name")], 4)
+    yield from met(
+        write_nerf, [("ids [0, 1, 2]", "no label has a name", strangers, "no label has a name")], 4
+    )
 
 
 # ScanNet and 7-Scenes
@@ -427,12 +573,21 @@ def replica() -> Iterator[Row]:
 EYE = "1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 TABLE, POINTS, SPLIT = "scannetv2-labels.modified.tsv", "points3d.ply", "splits.json"
 CONFIDENCE = "m2f_probabilities/20.npz"
-HEAD, IDS = "id\traw_category\tcocomapid\n", "ids must not be negative, and values of cocomapid must lie in 0...20"
+HEAD, IDS = (
+    "id\traw_category\tcocomapid\n",
+    ("ids must not be negative, and values of cocomapid must lie in 0...20"),
+)
 SURE = np.ones((6, 8), np.float32)
-NO_PLY, COPY, LISTS = "is not a readable PLY", "copy it again", "lacks lists of train and test names"
+NO_PLY, COPY, LISTS = (
+    "is not a readable PLY",
+    "copy it again",
+    ("lacks lists of train and test names"),
+)
 
 
-def header(n: object = 20, form: str = "binary_little_endian 1.0", axes: str = "xyz", more: str = "") -> bytes:
+def header(
+    n: object = 20, form: str = "binary_little_endian 1.0", axes: str = "xyz", more: str = ""
+) -> bytes:
     rows = "".join(f"property float {axis}\n" for axis in axes)
     return f"ply\nformat {form}\nelement vertex {n}\n{rows}{more}end_header\n".encode()
 
@@ -462,13 +617,18 @@ def scannet() -> Iterator[Row]:
         ("lists for x", lists + b"\xff" * 400, NO_PLY),
         ("words", header(2, "ascii 1.0") + b"a b c\nd e f\n", NO_PLY),
         ("too few rows of text", header(9, "ascii 1.0") + b"0 0 0\n" * 5, NO_PLY),
-        ("a face of 2^32 corners", header(more=faces) + coordinates() + struct.pack("<I", 2**32 - 1), NO_PLY),
+        (
+            "a face of 2^32 corners",
+            header(more=faces) + coordinates() + struct.pack("<I", 2**32 - 1),
+            NO_PLY,
+        ),
         ("no z", header(axes="xy") + coordinates(), "has no x, y, z"),
         ("0 points", header(0), "holds 0 points"),
         ("nan", header() + coordinates(NAN), "not finite"),
     ]
     tables = [("nothing", "", IDS), ("a negative id", f"{HEAD}-1\twall\t1\n", IDS),
-              ("class 21", f"{HEAD}1\twall\t21\n", IDS), ("short rows", f"{HEAD}1\n", "no usable columns"),
+              ("class 21", f"{HEAD}1\twall\t21\n", IDS), ("short rows", f"{HEAD}1\n", "no usable "
+                                                                                      "columns"),
               ("another column", "id\tnyu40id\n1\t1\n", "cocomapid"),
               ("an endless id", f"{HEAD}{'9' * 5000}\twall\t1\n", "no usable columns"),
               ("an open quote", f'{HEAD}1\t"{"a" * 200_000}', "is no table")]  # fmt: skip
@@ -489,11 +649,19 @@ def scannet() -> Iterator[Row]:
              "a long header": header(more="comment a\n" * 200_000) + coordinates(),
              "2,000 values a point": header(10**5, more="property double p\n" * 2000) + bytes(1 << 18)}  # fmt: skip
     heavy: list[Case] = [(POINTS, what, content, NO_PLY) for what, content in bombs.items()]
-    heavy += [(POINTS, "a pipe", no_file(POINTS, "pipe"), "a pipe"), (TABLE, "a terabyte", swollen(TABLE), "are read")]
+    heavy += [
+        (POINTS, "a pipe", no_file(POINTS, "pipe"), "a pipe"),
+        (TABLE, "a terabyte", swollen(TABLE), "are read"),
+    ]
     yield from met(write_sg, heavy, alone=True)
 
-    cases = [(SPLIT, f"test = {value!r}", keys(SPLIT, test=value), LISTS) for value in (None, "30", {"30": 1}, [30])]
-    cases.append((SPLIT, "a view in both lists", keys(SPLIT, train=["10"], test=["10"]), "10 is both"))
+    cases = [
+        (SPLIT, f"test = {value!r}", keys(SPLIT, test=value), LISTS)
+        for value in (None, "30", {"30": 1}, [30])
+    ]
+    cases.append(
+        (SPLIT, "a view in both lists", keys(SPLIT, train=["10"], test=["10"]), "10 is both")
+    )
     cases.append((CONFIDENCE, "missing", remove(CONFIDENCE), "is missing"))
     cases.append((CONFIDENCE, "cut short", cut(CONFIDENCE, 40), COPY))
     for what, content in {
@@ -509,7 +677,9 @@ def scannet() -> Iterator[Row]:
              (CONFIDENCE, "a pipe", no_file(CONFIDENCE, "pipe"), "a pipe")]  # fmt: skip
     yield from met(write_pl, heavy, alone=True)
     strangers = keys(SPLIT, train=["x"], test=["y"])
-    yield from met(write_pl, [("ingest.min_views", "a split of strangers", strangers, "splits.json")], 4)
+    yield from met(
+        write_pl, [("ingest.min_views", "a split of strangers", strangers, "splits.json")], 4
+    )
 
 
 def seven_scenes() -> Iterator[Row]:
@@ -525,7 +695,8 @@ def seven_scenes() -> Iterator[Row]:
         (color, "another size", picture(color, (16, 9)), "its camera 8x6"),
         (depth, "missing", remove(depth), "is missing"),
         (depth, "another size", picture(depth, (4, 4), "I;16"), "its photo 8x6"),
-        ("frame-000001", "two pictures", picture("frame-000001.color.jpg", form="JPEG"), "are both view"),
+        ("frame-000001", "two pictures", picture("frame-000001.color.jpg", form="JPEG"), "are both "
+                                                                                         "view"),
     ])  # fmt: skip
 
 

@@ -1,4 +1,6 @@
-"""Teachers that no scene could learn from: their TOML, their table of names, the model itself, labels to ask for."""
+"""Teachers that no scene could learn from: their TOML, their table of names, the model itself,
+labels to ask for.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ from malformed.edits import DEEP, Edit, all_of, no_file, npy, npz, picture, put,
 from malformed.row import Arguments, Row, stage
 
 MODEL, TOML, TABLE = "tiny.onnx", "tiny.toml", "tiny.npz"
-VALUES: list[tuple[str, str, str]] = [  # a key of tiny.toml, its value as TOML, a word of the message
+# a key of tiny.toml, its value as TOML, a word of the message
+VALUES: list[tuple[str, str, str]] = [
     ("name", '""', "name"),
     ("mean", "[nan, 0.5, 0.5]", "three numbers"),
     ("std", "[0, 0.5, 0.5]", "std"),
@@ -42,11 +45,27 @@ NAMES, ROWS = npy(np.array(list(COLORS))), np.eye(3, dtype=np.float32)
 TABLES: list[tuple[str, bytes, str]] = [
     ("no zip", b"no zip", "not a readable .npz"),
     ("no names", npz(embeddings=npy(ROWS)), "names"),
-    ("a name twice", npz(names=npy(np.array(["red", "red", "blue"])), embeddings=npy(ROWS)), "twice"),
-    ("objects for names", npz(names=npy(np.zeros(3), descr="|O"), embeddings=npy(ROWS)), "pickled objects"),
-    ("a null byte", npz(names=npy(np.array(["r\0d", "green", "blue"])), embeddings=npy(ROWS)), "names"),
+    (
+        "a name twice",
+        npz(names=npy(np.array(["red", "red", "blue"])), embeddings=npy(ROWS)),
+        "twice",
+    ),
+    (
+        "objects for names",
+        npz(names=npy(np.zeros(3), descr="|O"), embeddings=npy(ROWS)),
+        "pickled objects",
+    ),
+    (
+        "a null byte",
+        npz(names=npy(np.array(["r\0d", "green", "blue"])), embeddings=npy(ROWS)),
+        "names",
+    ),
     ("a row too few", npz(names=NAMES, embeddings=npy(ROWS[:2])), "embeddings"),
-    ("other channels", npz(names=NAMES, embeddings=npy(np.eye(3, 5))), "gives 3 channels, its text embeddings have 5"),
+    (
+        "other channels",
+        npz(names=NAMES, embeddings=npy(np.eye(3, 5))),
+        "gives 3 channels, its text embeddings have 5",
+    ),
     ("nan", npz(names=NAMES, embeddings=npy(ROWS * np.float32(np.nan))), "embeddings"),
 ]
 LABELS: list[tuple[str, bytes, str]] = [
@@ -61,7 +80,9 @@ LABELS: list[tuple[str, bytes, str]] = [
 def set_to(key: str, value: str) -> Edit:
     def edit(folder: Path) -> None:
         lines = dict(line.split(" = ", 1) for line in (folder / TOML).read_text().splitlines())
-        text = "".join(f"{name} = {said}\n" for name, said in (lines | {key: value}).items() if said)
+        text = "".join(
+            f"{name} = {said}\n" for name, said in (lines | {key: value}).items() if said
+        )
         (folder / TOML).write_text(text)
 
     return edit
@@ -81,7 +102,11 @@ def endless() -> Edit:
     body = helper.make_graph(
         [helper.make_node("Identity", ["on"], ["more"]), helper.make_node("Neg", ["x"], ["y"])],
         "body",
-        [value("k", TensorProto.INT64, []), value("on", TensorProto.BOOL, []), value("x", TensorProto.FLOAT, None)],
+        [
+            value("k", TensorProto.INT64, []),
+            value("on", TensorProto.BOOL, []),
+            value("x", TensorProto.FLOAT, None),
+        ],
         [value("more", TensorProto.BOOL, []), value("y", TensorProto.FLOAT, None)],
     )
     constants = {"count": np.array(2**62), "true": np.array(True)}
@@ -91,18 +116,26 @@ def endless() -> Edit:
 def huge() -> Edit:
     """An output of 120 GB."""
     zeros = helper.make_node("ConstantOfShape", ["shape"], ["zeros"])
-    return model(zeros, node("Add", "image", "zeros"), constants={"shape": np.array([1, 3, 100_000, 100_000])})
+    return model(
+        zeros,
+        node("Add", "image", "zeros"),
+        constants={"shape": np.array([1, 3, 100_000, 100_000])},
+    )
 
 
 def grown(factor: int) -> Edit:
-    """An output whose sides are `factor` times the image's, by a shape that is computed when it runs."""
+    """An output whose sides are `factor` times the image's, by a shape that is computed when it
+    runs.
+    """
     nodes = [
         helper.make_node("Shape", ["image"], ["shape"]),
         helper.make_node("Mul", ["shape", "factor"], ["larger"]),
         helper.make_node("ConstantOfShape", ["larger"], ["zeros"]),
         helper.make_node("ReduceMax", ["image"], ["most"]),
     ]
-    return model(*nodes, node("Add", "zeros", "most"), constants={"factor": np.array([1, 1, factor, factor])})
+    return model(
+        *nodes, node("Add", "zeros", "most"), constants={"factor": np.array([1, 1, factor, factor])}
+    )
 
 
 def folded() -> Edit:
@@ -165,8 +198,18 @@ def models() -> Iterator[tuple[str, str, Edit, str]]:
     """The file that is named, what is wrong, the edit, a word of the message."""
     relu = {"shape": (3, "H", "W")}
     yield MODEL, "no ONNX", put(MODEL, "no model"), "is not a usable ONNX model"
-    yield MODEL, "cut short", lambda folder: os.truncate(folder / MODEL, 60), "is not a usable ONNX model"
-    yield MODEL, "no nodes", changed(lambda held: held.graph.ClearField("node")), "is not a usable ONNX model"
+    yield (
+        MODEL,
+        "cut short",
+        lambda folder: os.truncate(folder / MODEL, 60),
+        ("is not a usable ONNX model"),
+    )
+    yield (
+        MODEL,
+        "no nodes",
+        changed(lambda held: held.graph.ClearField("node")),
+        ("is not a usable ONNX model"),
+    )
     yield MODEL, "two inputs", changed(two_inputs), "has 2 inputs"
     yield MODEL, "an input of rank 3", model(node("Relu"), **relu), "[1, 3, H, W] is needed"
     byte = model(node("Cast", to=TensorProto.FLOAT), kind=TensorProto.UINT8)
@@ -186,11 +229,18 @@ def models() -> Iterator[tuple[str, str, Edit, str]]:
     logits = all_of(set_to("labels", ""), set_to("output", '"logits"'))
     yield TOML, "no names of channels", logits, "names of the channels"
     yield "classes.txt", "too few classes", segmenter("red\ngreen\n"), "names 2 classes"
-    yield "classes.txt", "a class twice", segmenter("red\ngreen\nred\n"), "line 3: a name is given twice"
+    yield (
+        "classes.txt",
+        "a class twice",
+        segmenter("red\ngreen\nred\n"),
+        ("line 3: a name is given twice"),
+    )
 
 
 def met(named: str, what: str, edit: Edit, word: str, code: int = 3, alone: bool = False) -> Row:
-    """Asked for a picture of a room's size, and for the labels of a file where the edit has written one."""
+    """Asked for a picture of a room's size, and for the labels of a file where the edit has written
+    one.
+    """
 
     def build(folder: Path) -> Arguments:
         color_teacher(folder)
@@ -205,7 +255,12 @@ def met(named: str, what: str, edit: Edit, word: str, code: int = 3, alone: bool
 def many_channels(folder: Path) -> Arguments:
     color_teacher(folder, channels=65)
     write_table(folder / TABLE, embeddings=np.eye(3, 65))
-    return stage("teacher", folder, {"teacher": {"model": str(folder / MODEL)}}, capture=artifacts() / "ingest")
+    return stage(
+        "teacher",
+        folder,
+        {"teacher": {"model": str(folder / MODEL)}},
+        capture=artifacts() / "ingest",
+    )
 
 
 def rows() -> Iterator[Row]:
@@ -217,12 +272,16 @@ def rows() -> Iterator[Row]:
         yield met(TABLE, what, put(TABLE, content), word)
     for what, content, word in LABELS:
         yield met("labels.txt", what, put("labels.txt", content), word)
-    yield Row("teacher", f"{MODEL}: 65 channels", many_channels, (MODEL, "at most 64 can be rendered"), 2)
+    yield Row(
+        "teacher", f"{MODEL}: 65 channels", many_channels, (MODEL, "at most 64 can be rendered"), 2
+    )
     yield met(MODEL, "nan", model(node("Log")), "non-finite values", 4)
     yield met(MODEL, "an output of 120 GB", huge(), MODEL, 3, True)
     for factor in (100, 200, 400, 100_000):  # 0.37, 1.5, 5.9 GB, more than any machine has
         words = "bytes of memory are needed"
-        yield met(MODEL, f"an output of {factor} times the image's sides", grown(factor), words, 3, True)
+        yield met(
+            MODEL, f"an output of {factor} times the image's sides", grown(factor), words, 3, True
+        )
     yield met(MODEL, "constants of 3.6 GB", folded(), "bytes of memory are needed", 3, True)
     yield met(MODEL, "a loop of 2^62 steps", endless(), MODEL, 3, True)
     yield met(MODEL, "a pipe", no_file(MODEL, "pipe"), "is missing", 3, True)

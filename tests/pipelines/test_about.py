@@ -1,4 +1,6 @@
-"""What there is before anything runs: names, settings, versions; and nothing is written to say so."""
+"""What there is before anything runs: names, settings, versions; and nothing is written to say
+so.
+"""
 
 import subprocess
 import sys
@@ -31,13 +33,18 @@ def test_settings_lists_every_setting_with_its_default_range_and_meaning():
 
 def test_version_names_chebsplat_and_what_it_computes_with_and_imports_none_of_it():
     script = "import sys\nfrom chebsplat.pipelines.cli import main\ntry: main(['--version'])\n"
-    script += "except SystemExit as stop: assert not stop.code\nassert not {'torch', 'numba'} & set(sys.modules)"
+    script += (
+        "except SystemExit as stop: assert not stop.code\nassert not {'torch', 'numba'} & "
+        "set(sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert all(f"{name} " in done.stdout for name in ("chebsplat", "torch", "numba", "Python"))
 
 
-def test_scenes_of_private_data_are_listed_apart_and_say_what_to_set(quick_plans, tmp_path, monkeypatch):
+def test_scenes_of_private_data_are_listed_apart_and_say_what_to_set(
+    quick_plans, tmp_path, monkeypatch
+):
     monkeypatch.setenv("CHEBSPLAT_TEST_DATA", str(tmp_path / "data"))
     ours, apart = asked("scenes").stdout.split("scenes of data")
     assert "office0" in ours and "fox" not in ours
@@ -48,9 +55,13 @@ def test_scenes_of_private_data_are_listed_apart_and_say_what_to_set(quick_plans
     assert "there" in asked("scenes").stdout.split("data/fox")[1].splitlines()[0]
 
 
-def test_a_scene_whose_data_is_absent_can_be_given_another_folder(quick_plans, tmp_path, monkeypatch):
+def test_a_scene_whose_data_is_absent_can_be_given_another_folder(
+    quick_plans, tmp_path, monkeypatch
+):
     monkeypatch.setenv("CHEBSPLAT_TEST_DATA", str(tmp_path / "data"))
-    plan = Planner().plan("fox", f"source.kind=photos,source.path={photo_folder(tmp_path / 'photos')}")
+    plan = Planner().plan(
+        "fox", f"source.kind=photos,source.path={photo_folder(tmp_path / 'photos')}"
+    )
     assert plan.title.startswith("fox@")
     with pytest.raises(InputError, match=r"nowhere is not a folder; correct source\.path"):
         Planner().plan("fox", f"source.path={tmp_path}/nowhere")
@@ -85,7 +96,10 @@ def test_a_command_that_only_looks_makes_no_folder(command, quick_plans, tmp_pat
 
 def test_make_says_the_code_that_it_cannot_leave_with():
     done = subprocess.run(
-        ["make", "-o", ".venv/.ready", "plan", "scene=./nowhere/"], cwd=ROOT, capture_output=True, text=True
+        ["make", "-o", ".venv/.ready", "plan", "scene=./nowhere/"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 2  # GNU make's own, whatever failed
     assert "not a folder" in done.stderr and "Error 3" in done.stderr

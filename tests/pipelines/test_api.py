@@ -1,4 +1,6 @@
-"""A finished scene opened from Python: what it renders, answers and selects is what the stages say."""
+"""A finished scene opened from Python: what it renders, answers and selects is what the stages
+say.
+"""
 
 import numpy as np
 import pytest
@@ -84,7 +86,12 @@ def test_what_cannot_be_is_said(scene):
     for opacity in (1.5, -0.1, float("nan")):
         with pytest.raises(ConfigError, match="from 0 to 1 is needed"):
             scene.select(min_opacity=opacity)
-    for box in ((0, 0, 0, 1, 1), (0, 0, 0, 1, 0, 1), (0, 0, 0, 1, float("nan"), 1), (0, 0, 0, 1, 1, float("inf"))):
+    for box in (
+        (0, 0, 0, 1, 1),
+        (0, 0, 0, 1, 0, 1),
+        (0, 0, 0, 1, float("nan"), 1),
+        (0, 0, 0, 1, 1, float("inf")),
+    ):
         with pytest.raises(ConfigError, match="six numbers"):
             scene.select(box=box)
     n = len(scene)
@@ -93,7 +100,9 @@ def test_what_cannot_be_is_said(scene):
         ({"box": (500, 500, 500, 501, 501, 501)}, f"box leaves out {n}"),
         ({"min_opacity": 1.0, "label": "wall"}, f"opacity leaves out {n}"),
     ]:
-        with pytest.raises(DataFailure, match=f"no Gaussian of {n} is left .*{left_out}.*centres lie from"):
+        with pytest.raises(
+            DataFailure, match=f"no Gaussian of {n} is left .*{left_out}.*centres lie from"
+        ):
             scene.select(**filters)
     with pytest.raises(ConfigError, match="open the scene"):
         scene.query("wall")
@@ -104,7 +113,9 @@ def test_what_cannot_be_is_said(scene):
 def test_settings_are_values_and_name_the_links_as_the_command_does():
     given = {"train": {"steps": 10, "prune": False, "lr_means": 1e-4}, "source": {"path": "a, b"}}
     assert overrides(given) == given
-    assert suffix({"train": {"steps": 10}, "sfm": {"max_points": 9}}) == suffix("train.steps=10,sfm.max_points=9")
+    assert suffix({"train": {"steps": 10}, "sfm": {"max_points": 9}}) == suffix(
+        "train.steps=10,sfm.max_points=9"
+    )
     with pytest.raises(ConfigError, match="is a section"):
         overrides({"steps": 3})
 

@@ -1,4 +1,6 @@
-"""On a real Slurm: the bytes of one machine, a node that falls costs time alone, and little of it is spent waiting."""
+"""On a real Slurm: the bytes of one machine, a node that falls costs time alone, and little of it
+is spent waiting.
+"""
 
 import csv
 import os
@@ -47,7 +49,16 @@ def studied(folder, work, on, cluster, **values):
     """A study under way in the store `work`."""
     folder.mkdir(exist_ok=True)
     (folder / "toys.toml").write_text(STUDY.format(**values))
-    command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "study", folder / "toys.toml", "--on", on]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "chebsplat.pipelines.cli",
+        "study",
+        folder / "toys.toml",
+        "--on",
+        on,
+    ]
     command += ["--threads", "1", "--out", folder / on]
     command += ["--cores", "3"] if on == "local" else []  # the cluster has three
     environment = os.environ | cluster.environment | {"CHEBSPLAT_WORK": str(work)}
@@ -76,9 +87,14 @@ def test_a_node_that_falls_costs_time_alone(cluster, tmp_path):
                 key = half.name.split("-")[1]
                 fallen = cluster.node_of(key)
         cluster.fell(fallen)
-        cluster.wait_for(lambda: cluster.ask("squeue", "--noheader", "--states=PD", "--format=%i"), "slurmctld", 60)
+        cluster.wait_for(
+            lambda: cluster.ask("squeue", "--noheader", "--states=PD", "--format=%i"),
+            "slurmctld",
+            60,
+        )
         for number in cluster.ask("squeue", "--noheader", "--states=PD", "--format=%i"):
-            cluster.ask("scontrol", "update", f"JobId={number}", "StartTime=now")  # Slurm would wait two minutes
+            # Slurm would wait two minutes
+            cluster.ask("scontrol", "update", f"JobId={number}", "StartTime=now")
         finished(running)
     finally:
         running.kill()

@@ -1,4 +1,6 @@
-"""What goes to a cluster: which steps together, what they ask for, and what is said where there is no cluster."""
+"""What goes to a cluster: which steps together, what they ask for, and what is said where there is
+no cluster.
+"""
 
 import os
 import sys
@@ -32,7 +34,11 @@ def jobs(entries, on="slurm"):
     by_path = {item["path"]: item["key"] for item in entries}
     waits = {name: set() for name in made}
     for item in entries:
-        earlier = {job_of[by_path[path]] for path in (*item["inputs"].values(), *item["after"]) if path in by_path}
+        earlier = {
+            job_of[by_path[path]]
+            for path in (*item["inputs"].values(), *item["after"])
+            if path in by_path
+        }
         waits[job_of[item["key"]]] |= earlier - {job_of[item["key"]]}
     TopologicalSorter(waits).prepare()
     return sorted([stage_of[key] for key in one["keys"]] for one in made.values())
@@ -49,7 +55,9 @@ def test_on_one_machine_a_step_is_a_job():
 
 def test_steps_of_seconds_go_with_what_they_follow():
     toy = [["ingest", "sfm", "teacher", "agree"], ["train", "lift", "refine", "export", "evaluate"]]
-    assert [some[:5] for some in jobs(entries_of(wanted_steps(Planner().plan("toy"), None)))] == sorted(toy)
+    assert [
+        some[:5] for some in jobs(entries_of(wanted_steps(Planner().plan("toy"), None)))
+    ] == sorted(toy)
     office = jobs(entries_of(wanted_steps(Planner().plan("office0"), None)))
     assert ["ingest", "sfm", "describe", "encode", "onnx"] in office and ["train"] in office
     assert ["teacher", "agree", "learn"] in office
@@ -59,7 +67,9 @@ def test_steps_of_seconds_go_with_what_they_follow():
 @pytest.mark.parametrize("ablation", ["paper", ""])
 def test_no_job_of_a_sequence_or_of_what_is_half_done_waits_for_itself(tmp_path, ablation):
     (tmp_path / "mine.toml").write_text('scenes = ["toy", "office0", "toy", "office0"]')
-    plans = sequences.chain(Planner(), str(tmp_path / "mine.toml"), "knowledge.start=rooms", ablation)
+    plans = sequences.chain(
+        Planner(), str(tmp_path / "mine.toml"), "knowledge.start=rooms", ablation
+    )
     steps = {step.key: step for plan in plans for step in plan.steps}
     entries = entries_of(steps.values())
     assert len(jobs(entries)) < len(entries) / 2
@@ -75,7 +85,9 @@ def test_a_study_of_short_trainings_is_one_job_a_run():
 
 
 def test_jobs_ask_for_the_most_that_a_step_needs_for_the_time_of_all_and_for_a_gpu_where_one_computes():
-    made = cluster.jobs_of(entries_of(wanted_steps(Planner(device="cuda").plan("office0"), None), "cuda"), "slurm")
+    made = cluster.jobs_of(
+        entries_of(wanted_steps(Planner(device="cuda").plan("office0"), None), "cuda"), "slurm"
+    )
     train = next(one for name, one in made.items() if name.startswith("train"))
     assert train["gpus"] == 1 and train["mem_mb"] == cluster.NEEDS["train"].mem_mb
     assert train["minutes"] >= 5 * 239 / 60  # five times what 3000 steps took at most
@@ -151,7 +163,9 @@ def _step(arguments):
 
 
 @pytest.mark.parametrize(("codes", "code"), [("00", 0), ("03", 3), ("30", 3), ("09", 137)])
-def test_steps_of_a_job_have_processes_of_their_own_and_end_with_the_first_that_fails(codes, code, tmp_path):
+def test_steps_of_a_job_have_processes_of_their_own_and_end_with_the_first_that_fails(
+    codes, code, tmp_path
+):
     told = tmp_path / "told"
     calls = [[f"step{k}", one, str(told)] for k, one in enumerate(codes)]
     assert children.in_turn(_step, calls) == code

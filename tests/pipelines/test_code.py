@@ -1,4 +1,6 @@
-"""A key tells the code and the packages that a stage uses in its configuration, wherever they are installed."""
+"""A key tells the code and the packages that a stage uses in its configuration, wherever they are
+installed.
+"""
 
 import shutil
 import sys
@@ -25,11 +27,14 @@ def wheel(tmp_path):
 
 def test_the_code_of_a_stage_is_the_same_in_a_checkout_and_in_a_wheel(wheel):
     checkout, installation = Code(PACKAGE, {}), Code(wheel, {})
-    assert {stage: checkout.stage(stage) for stage in STAGES} == {stage: installation.stage(stage) for stage in STAGES}
+    assert {stage: checkout.stage(stage) for stage in STAGES} == {
+        stage: installation.stage(stage) for stage in STAGES
+    }
     with (wheel / "teachers/__init__.py").open("a") as file:
         file.write("ANOTHER = 1\n")
     edited = Code(wheel, installation.memo)
-    assert {s for s in STAGES if edited.stage(s) != checkout.stage(s)} == set()  # nothing runs what trained it
+    # nothing runs what trained it
+    assert {s for s in STAGES if edited.stage(s) != checkout.stage(s)} == set()
 
 
 @pytest.mark.parametrize("name", ["report.html", "style.css", "viewer.js"])
@@ -50,7 +55,9 @@ def extras(tmp_path, monkeypatch):
         for name in EXTRAS:
             folder = tmp_path / f"extras/{name}-1.dist-info"
             folder.mkdir(parents=True, exist_ok=True)
-            (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+            (folder / "METADATA").write_text(
+                f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
+            )
         monkeypatch.syspath_prepend(str(tmp_path / "extras"))
 
     return install
@@ -60,7 +67,9 @@ def keys(*arguments):
     return {step.stage: step.key for step in Planner().plan(*map(str, arguments)).steps}
 
 
-@pytest.mark.parametrize("settings", ["", "teacher.kind=auto", "train.semantics=false", "train.method=printed"])
+@pytest.mark.parametrize(
+    "settings", ["", "teacher.kind=auto", "train.semantics=false", "train.method=printed"]
+)
 def test_an_extra_that_a_scene_does_not_use_makes_nothing_stale(extras, settings):
     before = keys("toy", settings)
     extras()
@@ -71,7 +80,9 @@ def test_an_extra_that_a_scene_does_not_use_makes_nothing_stale(extras, settings
 def test_words_that_a_teacher_s_own_table_knows_need_no_text_encoder(extras, tmp_path):
     (tmp_path / "known.txt").write_text("sofa\nChairs: armchair\n")
     (tmp_path / "unknown.txt").write_text("sofa\nsomething to sit on\n")
-    known, unknown = (f"teacher.kind=auto,teacher.labels={tmp_path / name}.txt" for name in ("known", "unknown"))
+    known, unknown = (
+        f"teacher.kind=auto,teacher.labels={tmp_path / name}.txt" for name in ("known", "unknown")
+    )
     before, asking = keys("toy", known), keys("toy", unknown)
     extras()
     assert keys("toy", known) == before
@@ -82,13 +93,17 @@ def test_words_that_a_teacher_s_own_table_knows_need_no_text_encoder(extras, tmp
     assert keys("toy", unknown)["teacher"] != with_text["teacher"]
 
 
-def test_a_teacher_with_a_text_encoder_of_its_own_holds_the_version_of_what_runs_it(extras, tmp_path):
+def test_a_teacher_with_a_text_encoder_of_its_own_holds_the_version_of_what_runs_it(
+    extras, tmp_path
+):
     model = color_teacher(tmp_path)
     without = keys("toy", f"teacher.kind=onnx,teacher.model={model}")
     settings = model.with_suffix(".toml")
     for name in ("text.onnx", "tokenizer.json"):
         (tmp_path / name).write_text("{}")
-    settings.write_text(settings.read_text() + '\ntext = "text.onnx"\ntokenizer = "tokenizer.json"\n')
+    settings.write_text(
+        settings.read_text() + '\ntext = "text.onnx"\ntokenizer = "tokenizer.json"\n'
+    )
     before = keys("toy", f"teacher.kind=onnx,teacher.model={model}")
     extras()
     after = keys("toy", f"teacher.kind=onnx,teacher.model={model}")

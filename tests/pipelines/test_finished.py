@@ -31,7 +31,15 @@ def test_a_scene_is_meant_by_its_name_its_photos_its_links_or_its_artifact(tmp_p
     scene = photo_folder(tmp_path / "a/images")
     plan = run(scene)
     title, export = plan.title, f"work/{plan.title}/export"
-    for meant in (title, scene, "a/images", f"work/{title}", f"{work / title}/", plan.targets["export"], export):
+    for meant in (
+        title,
+        scene,
+        "a/images",
+        f"work/{title}",
+        f"{work / title}/",
+        plan.targets["export"],
+        export,
+    ):
         assert scene_folder(str(meant)).resolve() == work / title
         assert artifact_of(str(meant), "export").resolve() == plan.targets["export"]
     assert {path.resolve() for path in artifacts(title)} == set(plan.targets.values())

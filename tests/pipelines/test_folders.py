@@ -45,7 +45,11 @@ def test_a_name_of_ours_is_never_a_folder_s(tmp_path):
     for name in ("fox", "store"):
         folder = photo_folder(tmp_path / name)
         assert Planner().plan(folder).title == f"{name}-{digits(tmp_path / name)}"
-    assert Planner().plan(photo_folder(tmp_path / "study-method")).title.startswith("folder-study-method-")
+    assert (
+        Planner()
+        .plan(photo_folder(tmp_path / "study-method"))
+        .title.startswith("folder-study-method-")
+    )
 
 
 def test_planning_names_a_folder_and_keeps_nothing(tmp_path, work):

@@ -1,4 +1,6 @@
-"""Sets of lessons: processes add at once, killed ones spoil nothing, and a scene stays with what it is pinned to."""
+"""Sets of lessons: processes add at once, killed ones spoil nothing, and a scene stays with what it
+is pinned to.
+"""
 
 import json
 import signal
@@ -31,7 +33,9 @@ def made(name, **notes):
     """A lesson in the store, as a run leaves it."""
     path = store.artifact_path("learn", key_of(name))
     with artifact.publish(path, Manifest(SCHEMA, key_of(name), "learn")) as tmp:
-        write_lesson(tmp, Lesson((np.eye(3), np.ones((3, 2)), 1.0), {"scene": name, "given": True} | notes))
+        write_lesson(
+            tmp, Lesson((np.eye(3), np.ones((3, 2)), 1.0), {"scene": name, "given": True} | notes)
+        )
     return path
 
 
@@ -52,7 +56,8 @@ for path in map(Path, sys.argv[1:]):
 
 def test_processes_that_add_at_once_and_are_killed_leave_a_whole_set(work):
     paths = [made(f"lesson {k}") for k in range(100)]
-    shares = [[paths[(12 * worker + k) % 100] for k in range(25)] for worker in range(8)]  # each half its neighbour's
+    # each half its neighbour's
+    shares = [[paths[(12 * worker + k) % 100] for k in range(25)] for worker in range(8)]
 
     def begun(share):
         command = [sys.executable, "-c", ADDING, *map(str, share)]
@@ -69,7 +74,9 @@ def test_processes_that_add_at_once_and_are_killed_leave_a_whole_set(work):
         for _ in range(after):
             process.stdout.readline()
         process.send_signal(signal.SIGKILL)
-    assert [process.communicate() and process.returncode for process in running] == [-signal.SIGKILL] * 3 + [0] * 5
+    assert [process.communicate() and process.returncode for process in running] == [
+        -signal.SIGKILL
+    ] * 3 + [0] * 5
     named = [{path.name for path in share} for share in shares]
     assert set().union(*named[3:]) <= held() <= set().union(*named)
     for process in list(map(begun, shares[:3])):
@@ -89,7 +96,9 @@ def test_what_a_kill_leaves_between_record_and_lesson_is_no_member_and_is_added_
 
 def recalled(scene, settings="", **options):
     """Keys of the lessons that a scene starts from; the key of its last step but the report."""
-    steps = {step.stage: step for step in Planner(running=True, **options).plan(scene, settings).steps}
+    steps = {
+        step.stage: step for step in Planner(running=True, **options).plan(scene, settings).steps
+    }
     lessons = steps["recall"].inputs.keys() - {"start"} if "recall" in steps else set()
     return {role.removeprefix("lesson-") for role in lessons}, steps["refine"].key
 
@@ -98,7 +107,9 @@ def test_a_pin_holds_until_newer_lessons_are_asked_for_and_none_is_of_the_same_p
     days = iter((1, 3, 2, 4, 5, 6))
     monkeypatch.setattr(heads, "now", lambda: f"2026-01-0{next(days)}")
     _, late, _ = (add(name, "photos a") for name in ("a", "a again", "a between"))
-    heads.add("rooms", made("own"), Planner().plan("office0").lesson.capture, START, "office0, otherwise")
+    heads.add(
+        "rooms", made("own"), Planner().plan("office0").lesson.capture, START, "office0, otherwise"
+    )
     heads.add("rooms", made("of another encoder"), "photos z", key_of("another"), "z")
     assert recalled("office0")[0] == {late}
     pin = store.work() / "office0" / heads.PIN
@@ -106,7 +117,8 @@ def test_a_pin_holds_until_newer_lessons_are_asked_for_and_none_is_of_the_same_p
     before = recalled("office0", "refine.smooth=on"), recalled("office0", "describe.bandwidth=0.8")
     b = add("b", "photos b")
     after = recalled("office0", "refine.smooth=on"), recalled("office0", "describe.bandwidth=0.8")
-    assert before == after  # ablations of one capture start from the same, whatever was learned between them
+    # ablations of one capture start from the same, whatever was learned between them
+    assert before == after
     assert recalled("office1")[0] == {late, b, key_of("own")}
     assert recalled("office0", newer=True)[0] == recalled("office0")[0] == {late, b}
     assert recalled("office0", "knowledge.start=other")[0] == set()
@@ -122,7 +134,10 @@ def test_a_forgotten_lesson_that_a_pin_names_is_refused_with_the_remedy(work):
     add("a", "photos a")  # a run of the scene does not bring it back
     assert heads.members("rooms").keys() == {b}
     store.remove(store.artifact_path("learn", a))
-    with pytest.raises(ConfigError, match=f"office0 is pinned to the lesson {a}, which rooms has no more; add newer=1"):
+    with pytest.raises(
+        ConfigError,
+        match=f"office0 is pinned to the lesson {a}, which rooms has no more; add newer=1",
+    ):
         recalled("office0")
     assert recalled("office0", newer=True)[0] == {b}
     store.remove(store.artifact_path("learn", b))
@@ -149,21 +164,35 @@ def test_damaged_pins_and_records_are_refused_by_name():
 
 def test_scenes_of_a_sequence_start_from_the_lessons_of_those_before(tmp_path):
     kept = add("a", "photos a")
-    heads.add("rooms", made("office0 before"), Planner().plan("office0").lesson.capture, START, "office0")
+    heads.add(
+        "rooms", made("office0 before"), Planner().plan("office0").lesson.capture, START, "office0"
+    )
     (tmp_path / "mine.toml").write_text('scenes = ["office0", "office1", "office0", "room0"]')
     plans = chain(Planner(running=True), str(tmp_path / "mine.toml"))
-    found = [{role for step in plan.steps if step.stage == "recall" for role in step.inputs} for plan in plans]
+    found = [
+        {role for step in plan.steps if step.stage == "recall" for role in step.inputs}
+        for plan in plans
+    ]
     first, second, third, _ = (f"lesson-{plan.lesson.path.name}" for plan in plans)
     assert first == third
     kept = f"lesson-{kept}"
-    assert found == [{"start", kept}, {"start", kept, first}, {"start", kept, second}, {"start", kept, first, second}]
+    assert found == [
+        {"start", kept},
+        {"start", kept, first},
+        {"start", kept, second},
+        {"start", kept, first, second},
+    ]
 
 
 def test_a_set_is_learned_again_by_another_encoder_from_what_the_store_holds(capsys):
     config = {"scene": {"name": "a"}}
-    inputs = {role: {"key": key_of(of), "schema": "s/1"} for role, of in STAGES["learn"].roles.items()}
+    inputs = {
+        role: {"key": key_of(of), "schema": "s/1"} for role, of in STAGES["learn"].roles.items()
+    }
     for of in STAGES["learn"].roles.values():
-        with artifact.publish(store.artifact_path(of, key_of(of)), Manifest(STAGES[of].schema, key_of(of), of)):
+        with artifact.publish(
+            store.artifact_path(of, key_of(of)), Manifest(STAGES[of].schema, key_of(of), of)
+        ):
             pass
     path = store.artifact_path("learn", key_of("a"))
     with artifact.publish(path, Manifest(SCHEMA, key_of("a"), "learn", inputs, config)) as tmp:

@@ -22,7 +22,9 @@ with leases.held(Path(sys.argv[1])):
 
 def test_who_is_killed_is_followed_at_once_and_nobody_before(tmp_path):
     path = tmp_path / "held/lease"
-    holder = subprocess.Popen([sys.executable, "-c", ENDLESS, path], stdout=subprocess.PIPE, text=True)
+    holder = subprocess.Popen(
+        [sys.executable, "-c", ENDLESS, path], stdout=subprocess.PIPE, text=True
+    )
     assert holder.stdout.readline() == "held\n"
     told = []
 

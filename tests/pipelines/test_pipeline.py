@@ -28,7 +28,8 @@ from chebsplat.pipelines.work.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import OF_KNOWLEDGE, STAGES
 from chebsplat.stages.shape_models.answers import answered, inputs_of
 
-PLANNED = {name for name, stage in STAGES.items() if stage.of_scene} - {"pose"}  # of a source with poses
+# of a source with poses
+PLANNED = {name for name, stage in STAGES.items() if stage.of_scene} - {"pose"}
 KNOWING = "knowledge.start=rooms"  # the toy starts from none by itself
 ALL = [name for name in STAGES if name in PLANNED - {"channels", "recall"}]  # of a first scene
 ABOUT_SHAPE = ["describe", "encode", "learn", "onnx"]
@@ -46,7 +47,9 @@ def work(tmp_path, monkeypatch, code_memo):
 @pytest.fixture
 def source_tree(tmp_path):
     """A copy of the code that a test may edit."""
-    return shutil.copytree(PACKAGE, tmp_path / "code/chebsplat", ignore=shutil.ignore_patterns("__pycache__"))
+    return shutil.copytree(
+        PACKAGE, tmp_path / "code/chebsplat", ignore=shutil.ignore_patterns("__pycache__")
+    )
 
 
 def stale(package=PACKAGE, scene="toy", settings=KNOWING):
@@ -111,7 +114,9 @@ CODE_CHANGES = [
 ]
 
 
-@pytest.mark.parametrize(("change", "expected"), CODE_CHANGES, ids=lambda v: getattr(v, "__name__", ""))
+@pytest.mark.parametrize(
+    ("change", "expected"), CODE_CHANGES, ids=lambda v: getattr(v, "__name__", "")
+)
 def test_a_change_of_code_makes_exactly_these_stages_stale(tmp_path, source_tree, change, expected):
     finish(Planner(source_tree).plan("toy", KNOWING))
     assert stale(source_tree) == []
@@ -137,7 +142,9 @@ SETTING_CHANGES = [
 ]
 
 
-@pytest.mark.parametrize(("settings", "expected"), SETTING_CHANGES, ids=lambda v: v if isinstance(v, str) else "")
+@pytest.mark.parametrize(
+    ("settings", "expected"), SETTING_CHANGES, ids=lambda v: v if isinstance(v, str) else ""
+)
 def test_a_change_of_setting_makes_exactly_these_stages_stale(settings, expected):
     settings = f"{KNOWING},{settings}"
     finish(Planner().plan("toy", KNOWING))
@@ -158,8 +165,12 @@ def test_content_of_raw_files_counts_and_their_time_and_place_do_not(tmp_path):
     shutil.move(tmp_path / "photos", moved / "photos")
     assert stale(scene=f"{moved}/photos/") == []
     shutil.copy(moved / "photos/1.jpg", moved / "photos/2.jpg")
-    semantic = ("teacher", "agree", "lift", "refine", *OF_KNOWLEDGE)  # left out: nobody named a teacher
-    assert stale(scene=f"{moved}/photos/") == ["pose", *(stage for stage in ALL if stage not in semantic)]
+    # left out: nobody named a teacher
+    semantic = ("teacher", "agree", "lift", "refine", *OF_KNOWLEDGE)
+    assert stale(scene=f"{moved}/photos/") == [
+        "pose",
+        *(stage for stage in ALL if stage not in semantic),
+    ]
 
 
 def test_a_raw_file_under_another_folder_is_other_content(tmp_path):
@@ -193,12 +204,19 @@ def test_paths_are_those_of_the_user_s_folder_not_of_the_stage_s(tmp_path, monke
         (tmp_path / name).write_text('labels = "table.npz"  # another')
         again = Planner().plan("toy", settings)
         changed = [a.stage for a, b in zip(plan.steps, again.steps, strict=True) if a.key != b.key]
-        assert changed == [*(["channels"] if name != "names.txt" else []), "teacher", "agree", *AFTER_TRAIN]
+        assert changed == [
+            *(["channels"] if name != "names.txt" else []),
+            "teacher",
+            "agree",
+            *AFTER_TRAIN,
+        ]
         plan = again
 
 
 def teacher_of(*arguments):
-    return next(step for step in Planner().plan(*arguments).steps if step.stage == "teacher").sections["teacher"]
+    return next(
+        step for step in Planner().plan(*arguments).steps if step.stage == "teacher"
+    ).sections["teacher"]
 
 
 def test_the_embedded_teacher_is_used_unless_another_is_asked_for(tmp_path):
@@ -206,13 +224,20 @@ def test_the_embedded_teacher_is_used_unless_another_is_asked_for(tmp_path):
     for scene in (("office0",), ("toy", "teacher.kind=auto"), (photos, "teacher.kind=embedded")):
         teacher = teacher_of(*scene)
         assert (teacher["kind"], teacher["model"]) == ("onnx", str(EMBEDDED))
-    assert teacher_of("toy")["kind"] == teacher_of("office0", "teacher.kind=labels")["kind"] == "labels"
+    assert (
+        teacher_of("toy")["kind"]
+        == teacher_of("office0", "teacher.kind=labels")["kind"]
+        == "labels"
+    )
 
 
 def test_photos_without_labels_get_no_teacher_unasked_and_learn_how_to_get_one(tmp_path):
     plan = Planner().plan(photo_folder(tmp_path / "photos"))
     assert "teacher" not in plan.targets
-    assert all(told in plan.left_out["teacher"] for told in ("get-teacher", "docs/teachers.md", "kind=embedded"))
+    assert all(
+        told in plan.left_out["teacher"]
+        for told in ("get-teacher", "docs/teachers.md", "kind=embedded")
+    )
     assert "evaluate" in plan.targets
 
 
@@ -291,7 +316,10 @@ def test_the_printed_method_is_refused_where_nothing_teaches_it():
 
 
 def test_lifted_features_reach_the_export_and_trained_ones_do_not_wait_for_them():
-    by_stage = {step.stage: set(step.inputs) for step in Planner().plan("toy", "train.features=lifted").steps}
+    by_stage = {
+        step.stage: set(step.inputs)
+        for step in Planner().plan("toy", "train.features=lifted").steps
+    }
     assert by_stage["train"] == {"capture", "points"}
     assert by_stage["lift"] == {"capture", "gaussians", "features"}
     assert by_stage["refine"] == {"capture", "gaussians", "features", "lifted"}
@@ -355,7 +383,10 @@ def test_relinking_drops_stages_that_are_left_out_and_keeps_those_still_to_run(w
 
 
 def running_plan(work, plan, pid):
-    steps = [{"path": str(s.path), "inputs": {r: str(p) for r, p in s.inputs.items()}} for s in plan.steps]
+    steps = [
+        {"path": str(s.path), "inputs": {r: str(p) for r, p in s.inputs.items()}}
+        for s in plan.steps
+    ]
     folder = work / f".plans/abc-{pid}"
     folder.mkdir(parents=True)
     (folder / "plan.json").write_text(json.dumps({"steps": steps}))
@@ -393,7 +424,9 @@ def test_a_failed_run_tells_a_stage_that_failed_from_one_that_was_killed(tmp_pat
 
 def chebsplat(*arguments, **environment):
     command = [sys.executable, "-m", "chebsplat.pipelines.cli", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ | environment)
+    return subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, env=os.environ | environment
+    )
 
 
 FAST = "train.steps=12,train.n_densify=1,sfm.max_points=200,describe.n_regions=12"
@@ -406,7 +439,9 @@ def check_encoder(scene):
     assert len(wanted) > 100
     inputs = inputs_of(scene, described, knowledge)
     given = inputs._asdict() | {"neighbors": inputs.neighbors.astype(np.int64)}
-    runner = onnxruntime.InferenceSession(scene / "onnx/encoder.onnx", providers=["CPUExecutionProvider"])
+    runner = onnxruntime.InferenceSession(
+        scene / "onnx/encoder.onnx", providers=["CPUExecutionProvider"]
+    )
     answers = runner.run(None, given)[0]
     np.testing.assert_allclose(answers, answered(knowledge, inputs), atol=1e-4)
     np.testing.assert_allclose(answers, wanted, atol=2e-2)  # of features in half precision
@@ -420,7 +455,9 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
     assert page == str(next(work.glob("toy@*")) / "report/report.html")
     assert os.path.isfile(page)
     assert "to run: ingest" in first.stderr
-    table = {line.strip().split("  ")[0] for line in first.stderr.splitlines() if line.startswith("  ")}
+    table = {
+        line.strip().split("  ")[0] for line in first.stderr.splitlines() if line.startswith("  ")
+    }
     assert {"test PSNR", "mIoU", "Gaussians", "PLY"} <= table
     assert "its 2D teacher" in first.stderr
     times = {p: p.stat().st_mtime_ns for p in work.glob("store/*/*/artifact.json")}
@@ -453,7 +490,9 @@ def test_a_run_makes_the_report_and_a_second_run_does_nothing(work):
 def test_folders_may_be_called_what_a_shell_yaml_or_snakemake_take_for_their_own(tmp_path):
     name = "Anna's {room} #1: $5 `touch x`; touch x"
     scene, work = f"{write_colmap(tmp_path / name)}/", tmp_path / "work" / name
-    done = chebsplat("run", "--scene", scene, "--stage", "ingest", "--cores", "1", CHEBSPLAT_WORK=str(work))
+    done = chebsplat(
+        "run", "--scene", scene, "--stage", "ingest", "--cores", "1", CHEBSPLAT_WORK=str(work)
+    )
     assert done.returncode == 0, done.stderr
     assert list(work.glob("*/ingest/artifact.json"))
     assert not (ROOT / "x").exists() and not (work / "x").exists()
@@ -461,9 +500,15 @@ def test_folders_may_be_called_what_a_shell_yaml_or_snakemake_take_for_their_own
 
 @pytest.mark.xdist_group("cli")
 def test_a_failing_stage_gives_its_exit_code_and_nothing_half_made(work):
-    failed = chebsplat("run", "--scene", "toy", "--set", "ingest.test_every=10000,ingest.test_offset=9999," + FAST)
+    failed = chebsplat(
+        "run", "--scene", "toy", "--set", "ingest.test_every=10000,ingest.test_offset=9999," + FAST
+    )
     assert failed.returncode == 4
-    told = next(line for line in failed.stderr.splitlines() if line.startswith("ingest failed with exit code 4; log: "))
+    told = next(
+        line
+        for line in failed.stderr.splitlines()
+        if line.startswith("ingest failed with exit code 4; log: ")
+    )
     with open(told.split("log: ")[1]) as log:
         assert "test view" in log.read()
     assert not list(work.glob("store/ingest/*"))
@@ -471,10 +516,22 @@ def test_a_failing_stage_gives_its_exit_code_and_nothing_half_made(work):
 
 @pytest.mark.xdist_group("cli")
 def test_runs_at_the_same_time_make_every_artifact_once(work):
-    command = [sys.executable, "-m", "chebsplat.pipelines.cli", "run", "--scene", "toy", "--stage", "describe", "--set"]
+    command = [
+        sys.executable,
+        "-m",
+        "chebsplat.pipelines.cli",
+        "run",
+        "--scene",
+        "toy",
+        "--stage",
+        "describe",
+        "--set",
+    ]
     settings = [f"{FAST},{KNOWING}"] * 3 + [f"{FAST},{KNOWING},describe.bandwidth=0.8"]
     runs = [
-        subprocess.Popen([*command, some], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        subprocess.Popen(
+            [*command, some], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         for some in settings
     ]
     said = [run.communicate() for run in runs]
@@ -491,7 +548,8 @@ def test_help_of_every_stage_shows_its_options_and_needs_no_heavy_import():
         f"for stage in {list(STAGES)!r}:\n"
         "    try: main([stage, '--help'])\n"
         "    except SystemExit as stop: assert not stop.code\n"
-        "heavy = {'torch', 'numba', 'open3d', 'pycolmap', 'zarr', 'scipy', 'matplotlib'} & set(sys.modules)\n"
+        "heavy = {'torch', 'numba', 'open3d', 'pycolmap', 'zarr', 'scipy', 'matplotlib'} & "
+        "set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
@@ -502,6 +560,12 @@ def test_help_of_every_stage_shows_its_options_and_needs_no_heavy_import():
 
 
 def test_every_stage_is_a_plain_command(tmp_path):
-    (tmp_path / "toy.json").write_text(json.dumps({"source": {"kind": "generated", "preset": "toy", "seed": 1}}))
-    ingest = chebsplat("ingest", "--config", str(tmp_path / "toy.json"), "--out", str(tmp_path / "capture"))
-    assert (ingest.returncode, ingest.stdout.strip()) == (0, str(tmp_path / "capture")), ingest.stderr
+    (tmp_path / "toy.json").write_text(
+        json.dumps({"source": {"kind": "generated", "preset": "toy", "seed": 1}})
+    )
+    ingest = chebsplat(
+        "ingest", "--config", str(tmp_path / "toy.json"), "--out", str(tmp_path / "capture")
+    )
+    assert (ingest.returncode, ingest.stdout.strip()) == (0, str(tmp_path / "capture")), (
+        ingest.stderr
+    )

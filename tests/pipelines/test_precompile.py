@@ -1,4 +1,6 @@
-"""The first training on a machine has its kernels compiled side by side; later ones lose no time over it."""
+"""The first training on a machine has its kernels compiled side by side; later ones lose no time
+over it.
+"""
 
 import fcntl
 import os
@@ -45,7 +47,9 @@ def kept(folder, *parts):
         (folder / f"rehearsed-{part.__name__}").touch()
 
 
-def test_nothing_is_rehearsed_twice_nor_on_one_thread_nor_where_nothing_is_kept(tmp_path, monkeypatch):
+def test_nothing_is_rehearsed_twice_nor_on_one_thread_nor_where_nothing_is_kept(
+    tmp_path, monkeypatch
+):
     def rasterizer():
         raise AssertionError("rehearsed")
 
@@ -105,7 +109,9 @@ def test_what_compiles_beside_a_training_ends_with_it(how, tmp_path):
     (tmp_path / "breaks_off.py").write_text(BREAKS_OFF)
     command = [sys.executable, str(tmp_path / "breaks_off.py"), how]
     environment = os.environ | {"CHEBSPLAT_CACHE": str(tmp_path / "kept")}
-    ran = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment)
+    ran = subprocess.run(
+        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment
+    )
     lock, *rest = ran.stdout.split()
     assert rest == (["True"] if how == "killed" else ["True", "False", "False"])
     until = time.monotonic() + 5

@@ -1,4 +1,6 @@
-"""An artifact is published under the key of what was read, or not at all, whatever becomes of the sources meanwhile."""
+"""An artifact is published under the key of what was read, or not at all, whatever becomes of the
+sources meanwhile.
+"""
 
 import json
 import os
@@ -75,7 +77,10 @@ CHANGES = [edited, added, removed, replaced]
 def test_photos_that_change_after_they_were_planned_are_named(photos, change, when):
     step, _ = planned("ingest", photos.parent)
     named = change(photos) if when == "before" else ""
-    with pytest.raises(InputError, match="run again") as error, unchanged("ingest", step.sections, step.raw):
+    with (
+        pytest.raises(InputError, match="run again") as error,
+        unchanged("ingest", step.sections, step.raw),
+    ):
         assert when == "while"
         named = change(photos)
     assert named in str(error.value)
@@ -111,25 +116,34 @@ def test_models_labels_and_weights_are_watched_too(tmp_path, stage, file):
     step, _ = planned(stage, "toy", settings)
     images = sorted(reference.iterdir())
     watched = {"model": model, "reference": images[0], "labels": labels, "weights": weights}[file]
-    with pytest.raises(InputError, match=f"{watched} has changed"), unchanged(stage, step.sections, step.raw):
+    with (
+        pytest.raises(InputError, match=f"{watched} has changed"),
+        unchanged(stage, step.sections, step.raw),
+    ):
         same_size_and_time(watched, watched.read_bytes()[:-1] + b"?")
 
 
 def behind(*names):
     """These stages, and all that read anything of them."""
     found = set(names)
-    while more := {name for name, stage in STAGES.items() if found & {*stage.roles.values()}} - found:
+    while (
+        more := {name for name, stage in STAGES.items() if found & {*stage.roles.values()}} - found
+    ):
         found |= more
     return found
 
 
 @pytest.mark.parametrize("weights", ["", "tiny.onnx.data", "tiny.onnx_data", "weights.bin"])
-def test_any_byte_that_a_teacher_reads_makes_it_and_what_follows_anew_and_nothing_else_does(tmp_path, weights):
+def test_any_byte_that_a_teacher_reads_makes_it_and_what_follows_anew_and_nothing_else_does(
+    tmp_path, weights
+):
     """Its text encoder's, too; the files are those of the graph, not of a usual name."""
     model = color_teacher(tmp_path, text="text.onnx", tokenizer="tokenizer.json")
     (tmp_path / "tokenizer.json").write_text("{}")
     shutil.copy(model, tmp_path / "text.onnx")
-    read = {name: tmp_path / name for name in ("tiny.onnx", "tiny.toml", "tokenizer.json", "text.onnx")}
+    read = {
+        name: tmp_path / name for name in ("tiny.onnx", "tiny.toml", "tokenizer.json", "text.onnx")
+    }
     if weights:
         moved_out(model, weights)
         moved_out(tmp_path / "text.onnx", "words.bin")
@@ -142,20 +156,30 @@ def test_any_byte_that_a_teacher_reads_makes_it_and_what_follows_anew_and_nothin
     before, follows = keys(), behind("channels", "teacher")
     for name, path in read.items():
         data = path.read_bytes()
-        path.write_bytes(data + b"\n" if name.endswith(("toml", "json")) else data[:-1] + bytes([data[-1] ^ 1]))
+        path.write_bytes(
+            data + b"\n" if name.endswith(("toml", "json")) else data[:-1] + bytes([data[-1] ^ 1])
+        )
         if name == "tiny.onnx" and weights:  # a graph that parses
             path.write_bytes(data + onnx.ModelProto(doc_string="other").SerializeToString())
-        assert {stage for stage, key in keys().items() if key != before[stage]} == follows & {*before}, name
+        assert {stage for stage, key in keys().items() if key != before[stage]} == follows & {
+            *before
+        }, name
         path.write_bytes(data)
     write_table(tmp_path / "tiny.npz", embeddings=2 * np.array([*COLORS.values()]))
     assert {stage for stage, key in keys().items() if key != before[stage]} == follows & {*before}
     write_table(tmp_path / "tiny.npz")
-    for stray in {"tiny.onnx.data", "tiny.onnx_data", "weights.bin", "tiny.relevancy.json"} - {weights}:
+    for stray in {"tiny.onnx.data", "tiny.onnx_data", "weights.bin", "tiny.relevancy.json"} - {
+        weights
+    }:
         (tmp_path / stray).write_bytes(b"of something else")
     assert keys() == before
     if weights:
         (tmp_path / weights).unlink()
-        with pytest.raises(InputError, match=rf"{weights} is missing; .*tiny.onnx keeps weights there"):
+        with pytest.raises(
+            InputError,
+            match=rf"{weights} is missing; .*tiny.onnx keeps weights "
+            r"there",
+        ):
             keys()
 
 
@@ -176,7 +200,9 @@ def test_a_file_that_has_changed_just_now_is_read_again(photos):
     assert not found[str(photos / "1.png")][2]
 
 
-@pytest.mark.parametrize("damage", ["[]", "{", '{"PATH": 5}', '{"PATH": [1]}', '{"PATH": [[1, 2], 7]}', "[" * 10**5])
+@pytest.mark.parametrize(
+    "damage", ["[]", "{", '{"PATH": 5}', '{"PATH": [1]}', '{"PATH": [[1, 2], 7]}', "[" * 10**5]
+)
 def test_a_damaged_memory_of_hashes_costs_time_only(photos, own_work, damage):
     step, _ = planned("ingest", photos.parent)
     code = next(path for path in Planner().code.memo)

@@ -1,4 +1,6 @@
-"""Scenes in order: what each reads of the one before, and what a change of the order makes stale."""
+"""Scenes in order: what each reads of the one before, and what a change of the order makes
+stale.
+"""
 
 import pytest
 from shared import ROOT
@@ -57,26 +59,38 @@ CHANGES = [  # the new order, and what stays as it was: scenes that come before 
 ]
 
 
-@pytest.mark.parametrize(("order", "untouched"), CHANGES, ids=lambda v: "-".join(v) if isinstance(v, tuple) else "")
+@pytest.mark.parametrize(
+    ("order", "untouched"), CHANGES, ids=lambda v: "-".join(v) if isinstance(v, tuple) else ""
+)
 def test_a_change_of_order_makes_exactly_what_depends_on_it_stale(sequence, order, untouched):
     before, after = dict(keys(sequence(*ORDER))), dict(keys(sequence(*order)))
     for scene in before.keys() & after.keys():
         changed = {stage for stage, key in after[scene].items() if before[scene][stage] != key}
-        assert changed == (set() if scene in untouched else before[scene].keys() - BEFORE_TRAIN), scene
+        assert changed == (set() if scene in untouched else before[scene].keys() - BEFORE_TRAIN), (
+            scene
+        )
 
 
 def test_scene_k_reads_the_training_of_scene_k_minus_one_and_the_first_none(sequence):
     found = chain(Planner(), sequence(*ORDER), LABELS, "paper")
     for place, plan in enumerate(found):
-        read = {step.stage: step.inputs["earlier"] for step in plan.steps if "earlier" in step.inputs}
+        read = {
+            step.stage: step.inputs["earlier"] for step in plan.steps if "earlier" in step.inputs
+        }
         assert read == ({"train": found[place - 1].targets["train"]} if place else {})
-    assert [plan.title for plan in found[:2]] == [f"mine-1-toy@paper+{LABELS}", f"mine-2-office0@paper+{LABELS}"]
+    assert [plan.title for plan in found[:2]] == [
+        f"mine-1-toy@paper+{LABELS}",
+        f"mine-2-office0@paper+{LABELS}",
+    ]
     stages = [step.stage for step in wanted_steps(found[2], "train", found)]
     assert (stages.count("train"), stages.count("evaluate")) == (3, 0)
 
 
 def test_the_first_scene_of_a_sequence_is_the_scene_alone(sequence):
-    (first, _), alone = chain(Planner(), sequence("toy", "office0"), "", "paper"), Planner().plan("toy", "", "paper")
+    (first, _), alone = (
+        chain(Planner(), sequence("toy", "office0"), "", "paper"),
+        Planner().plan("toy", "", "paper"),
+    )
     assert first.targets == alone.targets
 
 

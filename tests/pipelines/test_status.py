@@ -45,7 +45,9 @@ def test_status_tells_what_runs_waits_and_has_failed_with_the_end_of_its_log():
         lines = told("status").splitlines()
         n_waiting = len(entries) - 3
         assert lines[0].endswith(f"1 done, 1 runs, {n_waiting} waits, 1 failed")
-        assert any(line.split()[:2] == ["failed", "sfm"] and "exit code 4" in line for line in lines)
+        assert any(
+            line.split()[:2] == ["failed", "sfm"] and "exit code 4" in line for line in lines
+        )
         assert "    line 8" in lines and "    line 3" not in lines
         assert re.search(r"\n  runs +agree +[0-9a-f]{16}  4\d s on node7\n", told("status"))
         assert "1 teacher" in lines[-1]
@@ -88,11 +90,14 @@ def test_scenes_that_nothing_was_added_to_for_long_are_given_up_with_what_they_a
     assert told("clean-stale", "--older-than", "9d", "--yes").split()[-2:] == ["0", "folders"]
     listed = told("clean-stale", "--older-than", "7d")
     only = set(plans[0].targets.values()) - set(plans[1].targets.values())
-    assert 0 < len(only) < len(plans[0].steps)  # the other one's are made of some of them, though they are as old
+    # the other one's are made of some of them, though they are as old
+    assert 0 < len(only) < len(plans[0].steps)
     assert str(store.work() / "toy") in listed and f"in {len(only)} folders; yes=1" in listed
     told("clean-stale", "--older-than", "7d", "--yes")
     assert not (store.work() / "toy").exists() and (store.work() / plans[1].title).is_dir()
-    assert not any(path.exists() for path in only) and all(path.exists() for path in plans[1].targets.values())
+    assert not any(path.exists() for path in only) and all(
+        path.exists() for path in plans[1].targets.values()
+    )
 
 
 def test_ls_counts_what_scenes_share_in_each_and_apart_what_is_one_s_alone():
@@ -100,7 +105,10 @@ def test_ls_counts_what_scenes_share_in_each_and_apart_what_is_one_s_alone():
         plan = Planner(running=True).plan("toy", settings)
         finish(plan)
         for step in plan.steps:
-            if "weight" not in (manifest := json.loads((step.path / "artifact.json").read_text()))["files"]:
+            if (
+                "weight"
+                not in (manifest := json.loads((step.path / "artifact.json").read_text()))["files"]
+            ):
                 (step.path / "weight").write_bytes(bytes(10**6))
                 manifest["files"]["weight"] = {"bytes": 10**6, "sha256": "0" * 64}
                 (step.path / "artifact.json").write_text(json.dumps(manifest))

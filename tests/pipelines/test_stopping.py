@@ -1,4 +1,6 @@
-"""A run that is stopped or killed takes all its processes with it, leaves nothing half, and says what is kept."""
+"""A run that is stopped or killed takes all its processes with it, leaves nothing half, and says
+what is kept.
+"""
 
 import os
 import signal
@@ -31,8 +33,12 @@ def in_a_job(run, seconds=120):
 
 @pytest.fixture
 def unmuted():
-    """Signals as a terminal's shell leaves them, however the tests were started (nohup, in the background)."""
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
+    """Signals as a terminal's shell leaves them, however the tests were started (nohup, in the
+    background).
+    """
+    before = {
+        number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)
+    }
     before |= {signal.SIGINT: signal.signal(signal.SIGINT, signal.default_int_handler)}
     yield
     for number, handler in before.items():
@@ -42,7 +48,9 @@ def unmuted():
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.usefixtures("unmuted")
 def test_a_stopped_command_says_what_is_kept_and_leaves_as_shells_know_it(number):
-    group = Guarded(commands={"wait": click.Command("wait", callback=lambda: os.kill(os.getpid(), number))})
+    group = Guarded(
+        commands={"wait": click.Command("wait", callback=lambda: os.kill(os.getpid(), number))}
+    )
     result = CliRunner().invoke(group, ["wait"])
     assert result.exit_code == 128 + number
     assert f"stopped by {number.name}; what was finished is kept" in result.stderr
@@ -91,7 +99,9 @@ with heeded():
 
 def test_of_a_session_that_is_ended_nothing_is_left_though_it_cannot_listen():
     command = f"{sys.executable} -P -c '{BUSY}' & wait"
-    process = subprocess.Popen(["sh", "-c", command], stdout=subprocess.PIPE, start_new_session=True, text=True)
+    process = subprocess.Popen(
+        ["sh", "-c", command], stdout=subprocess.PIPE, start_new_session=True, text=True
+    )
     number = int(process.stdout.readline())
     began = time.monotonic()
     children.end(process)
@@ -119,7 +129,9 @@ def test_what_breaks_because_of_a_stop_is_the_stop(capsys):
         Deaf()
         raise ImportError("partially initialized module")
 
-    result = CliRunner().invoke(Guarded(commands={"wait": click.Command("wait", callback=deaf_then_broken)}), ["wait"])
+    result = CliRunner().invoke(
+        Guarded(commands={"wait": click.Command("wait", callback=deaf_then_broken)}), ["wait"]
+    )
     assert result.exit_code == 143
     assert "Traceback" not in result.stderr + capsys.readouterr().err
 

@@ -1,4 +1,6 @@
-"""The work folder: names that lead nowhere else, links that lead in circles, members that are gone."""
+"""The work folder: names that lead nowhere else, links that lead in circles, members that are
+gone.
+"""
 
 import json
 import os
@@ -22,7 +24,9 @@ def work(tmp_path, monkeypatch, code_memo):
 
 def damaged(path, how):
     member = path / "data.bin"
-    with artifact.publish(path, Manifest("chebsplat.points/2", path.name, "sfm"), force=True) as tmp:
+    with artifact.publish(
+        path, Manifest("chebsplat.points/2", path.name, "sfm"), force=True
+    ) as tmp:
         (tmp / "data.bin").write_bytes(bytes(100))
     if how == "a member is gone":
         member.unlink()
@@ -35,7 +39,8 @@ def damaged(path, how):
 
 
 @pytest.mark.parametrize(
-    "how", ["a member is gone", "a member is cut off", "the manifest is cut off", "the manifest is gone"]
+    "how",
+    ["a member is gone", "a member is cut off", "the manifest is cut off", "the manifest is gone"],
 )
 def test_a_damaged_artifact_is_stale_alone(how):
     plan = Planner().plan("toy")
@@ -52,7 +57,9 @@ def test_a_damaged_artifact_keeps_what_it_was_made_of_from_clean_stale():
     store.link("toy", {"report": plan.targets["report"]})
     inputs = {"capture": {"key": plan.targets["ingest"].name, "schema": "s/1"}}
     path = plan.targets["sfm"]
-    with artifact.publish(path, Manifest("chebsplat.points/2", path.name, "sfm", inputs), force=True) as tmp:
+    with artifact.publish(
+        path, Manifest("chebsplat.points/2", path.name, "sfm", inputs), force=True
+    ) as tmp:
         (tmp / "data.bin").write_bytes(bytes(100))
     (path / "data.bin").unlink()
     assert {path, plan.targets["ingest"]}.isdisjoint(found for found, _ in store.unnamed())
@@ -74,7 +81,9 @@ def test_links_that_lead_in_a_circle_or_out_of_the_store_are_removed_alone(work,
     assert artifact.verify(tmp_path / "mine")
 
 
-@pytest.mark.parametrize("name", ["../elsewhere", "/elsewhere", ".", "..", ".hidden", "a/b", "", "a\0b"])
+@pytest.mark.parametrize(
+    "name", ["../elsewhere", "/elsewhere", ".", "..", ".hidden", "a/b", "", "a\0b"]
+)
 def test_links_and_heads_never_lead_out_of_the_work_folder(work, name):
     before = sorted(work.parent.rglob("*"))
     with pytest.raises(ConfigError):

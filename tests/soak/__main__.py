@@ -1,4 +1,5 @@
-"""`make soak`: kills, full disks, and runs by the hundred; build/soak-*.csv. Arguments: parts, and counts.
+"""`make soak`: kills, full disks, and runs by the hundred; build/soak-*.csv. Arguments: parts, and
+counts.
 
 make soak                                  kills=200 stops=50 disk=20 runs=60
 make soak args="kills=20 stops=5"          these parts alone
@@ -51,7 +52,10 @@ def do_kills(folder: Path, asked: dict[str, int]) -> int:
         some = [row for row in rows if row.how == how]
         longest, faults = max(row.seconds for row in some), sum(bool(row.fault) for row in some)
         print(f"{how:28s}{len(some):7d}{longest:14.1f} s{faults:8d}")
-    print(f"{finished} scenes finished after their blows, with the bytes of an undisturbed run; {table('kills', rows)}")
+    print(
+        f"{finished} scenes finished after their blows, with the bytes of an undisturbed run; "
+        f"{table('kills', rows)}"
+    )
     return sum(bool(row.fault) for row in rows)
 
 
@@ -86,10 +90,13 @@ def do_runs(folder: Path, asked: dict[str, int]) -> int:
     clean = [sys.executable, "-m", "chebsplat.pipelines.cli", "clean-stale", "--yes"]
     subprocess.run(clean, env=environment, check=True)
     there, named = sizes(work)
-    faults = growth(rows) + ([f"{there} bytes in the store, {named} in its manifests"] if there != named else [])
+    faults = growth(rows) + (
+        [f"{there} bytes in the store, {named} in its manifests"] if there != named else []
+    )
     for row in (rows[0], rows[min(WARM, len(rows) - 1)], rows[len(rows) // 2], rows[-1]):
         print(row)
-    print(f"{len(rows)} runs; after clean-stale {there:,} bytes in the store, {named:,} in its manifests; "
+    print(f"{len(rows)} runs; after clean-stale {there:,} bytes in the store, {named:,} in its "
+          "manifests; "
           f"{'; '.join(faults) or 'flat'}; {table('runs', rows)}")  # fmt: skip
     return len(faults)
 
@@ -98,7 +105,11 @@ def main(arguments: list[str]) -> int:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's `&` has runs ignore it
     asked, faults = counts(arguments), 0
     folder = Path(tempfile.mkdtemp(prefix="soak-"))
-    for part, names in {do_kills: ("kills", "stops"), do_disk: ("disk",), do_runs: ("runs",)}.items():
+    for part, names in {
+        do_kills: ("kills", "stops"),
+        do_disk: ("disk",),
+        do_runs: ("runs",),
+    }.items():
         if any(asked.get(name) for name in names):
             began = time.monotonic()
             place = folder / names[0]

@@ -1,7 +1,8 @@
-"""Runs whose disk is full at a random point: exit code 4, nothing half, and they finish when there is room again.
+"""Runs whose disk is full at a random point: exit code 4, nothing half, and they finish when there
+is room again.
 
-The disk is a tmpfs in a mount namespace of its own, which ends with the process; without the right to make one there is
-nothing to try.
+The disk is a tmpfs in a mount namespace of its own, which ends with the process; without the right
+to make one there is nothing to try.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ SIZE = 64 << 20  # bytes
 
 @dataclass
 class Full:
-    """A run to a stage that found so many bytes free of the many that it wants. fault: empty if all is well."""
+    """A run to a stage that found so many bytes free of the many that it wants. fault: empty if all
+    is well.
+    """
 
     stage: str
     free: int
@@ -38,7 +41,9 @@ def namespace() -> list[str] | None:
     for extra in ([], ["--user", "--map-root-user"]):
         command = ["unshare", "--mount", *extra]
         try:
-            tried = subprocess.run([*command, "mount", "-t", "tmpfs", "tmpfs", "/tmp"], capture_output=True)
+            tried = subprocess.run(
+                [*command, "mount", "-t", "tmpfs", "tmpfs", "/tmp"], capture_output=True
+            )
         except FileNotFoundError:
             return None
         if tried.returncode == 0:
@@ -80,11 +85,16 @@ def one(disk: Path, number: int, stage: str, free: int, wanted: int, whole: dict
 
 
 def disks(folder: Path, count: int, seed: int = 0) -> list[Full]:
-    """Full disks of a random free size, in the namespace; by turns for what a disk meets first, and for all stages."""
+    """Full disks of a random free size, in the namespace; by turns for what a disk meets first, and
+    for all stages.
+    """
     disk, needs = folder / "disk", {}
     mount(disk, f"size={SIZE}")
     for stage in ("teacher", "export"):
-        before, run = shutil.disk_usage(disk).free, Run(disk / stage, stage=stage, words=folder / f"{stage}.stderr")
+        before, run = (
+            shutil.disk_usage(disk).free,
+            Run(disk / stage, stage=stage, words=folder / f"{stage}.stderr"),
+        )
         if run.finish():
             raise RuntimeError(run.stderr)
         needs[stage] = (before - shutil.disk_usage(disk).free, contents(disk / stage))
@@ -95,7 +105,8 @@ def disks(folder: Path, count: int, seed: int = 0) -> list[Full]:
         wanted, whole = needs[stage]
         rows.append(one(disk, number, stage, int(rng.uniform(0.002, 0.9) * wanted), wanted, whole))
         row = rows[-1]
-        print(f"disk: {row.free:,} of {row.wanted:,} bytes free: exit code {row.code} after {row.finished} artifacts, "
+        print(f"disk: {row.free:,} of {row.wanted:,} bytes free: exit code {row.code} after "
+              f"{row.finished} artifacts, "
               f"then {row.again}{'; ' + row.fault if row.fault else ''}", file=sys.stderr, flush=True)  # fmt: skip
     return rows
 

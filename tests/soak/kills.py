@@ -1,4 +1,6 @@
-"""Runs that are killed or stopped at random moments: nothing half, no process left, the same bytes in the end."""
+"""Runs that are killed or stopped at random moments: nothing half, no process left, the same bytes
+in the end.
+"""
 
 from __future__ import annotations
 
@@ -86,8 +88,14 @@ def strike(run: Run, how: str, delay: float, whole: dict[str, str]) -> Blow | No
 
 
 def hidden_by(run: Run) -> list[Path]:
-    """Unfinished artifacts of processes that could have removed them (states of a training are kept)."""
-    return [path for path in hidden(run.work) if path.name.startswith(".tmp-") and path not in run.before]
+    """Unfinished artifacts of processes that could have removed them (states of a training are
+    kept).
+    """
+    return [
+        path
+        for path in hidden(run.work)
+        if path.name.startswith(".tmp-") and path not in run.before
+    ]
 
 
 def undisturbed(work: Path) -> tuple[dict[str, str], float]:
@@ -103,8 +111,12 @@ def undisturbed(work: Path) -> tuple[dict[str, str], float]:
     return whole, seconds
 
 
-def lane(folder: Path, blows: list[str], whole: dict[str, str], seconds: float, seed: int) -> tuple[list[Blow], int]:
-    """Blows to one scene after another in `folder`; those that hit, and how many scenes were finished afterwards."""
+def lane(
+    folder: Path, blows: list[str], whole: dict[str, str], seconds: float, seed: int
+) -> tuple[list[Blow], int]:
+    """Blows to one scene after another in `folder`; those that hit, and how many scenes were
+    finished afterwards.
+    """
     rng, waiting, hit, finished = random.Random(seed), list(blows), [], 0
     while waiting:
         work, some = folder / f"{seed}-{finished}", 0
@@ -115,10 +127,15 @@ def lane(folder: Path, blows: list[str], whole: dict[str, str], seconds: float, 
             some += 1
             waiting.pop(0)
             hit.append(blow)
-            print(f"kills: {blow.how} after {blow.delay:.1f} s, gone in {blow.seconds:.1f} s, {len(waiting)} to come"
+            print(f"kills: {blow.how} after {blow.delay:.1f} s, gone in {blow.seconds:.1f} s, "
+                  f"{len(waiting)} to come"
                   f"{'; ' + blow.fault if blow.fault else ''}", file=sys.stderr, flush=True)  # fmt: skip
         run = Run(work)
-        fault = f"exit code {run.finish()}: {run.stderr[-300:]}" if run.finish() else different(work, whole, True)
+        fault = (
+            f"exit code {run.finish()}: {run.stderr[-300:]}"
+            if run.finish()
+            else different(work, whole, True)
+        )
         finished += 1
         if fault:
             print(f"kills: the run after {some} blows: {fault}", file=sys.stderr, flush=True)
@@ -133,6 +150,8 @@ def kills(folder: Path, kills: int, stops: int) -> tuple[list[Blow], int]:
     whole, seconds = undisturbed(folder)
     blows = turns(kills, stops)
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        lanes = [pool.submit(lane, folder, blows[k::AT_ONCE], whole, seconds, k) for k in range(AT_ONCE)]
+        lanes = [
+            pool.submit(lane, folder, blows[k::AT_ONCE], whole, seconds, k) for k in range(AT_ONCE)
+        ]
         found = [lane.result() for lane in lanes]
     return [blow for some, _ in found for blow in some], sum(count for _, count in found)

@@ -1,6 +1,8 @@
-"""Run after run in one process, each with settings of its own: memory, open files and hidden files stay as they are.
+"""Run after run in one process, each with settings of its own: memory, open files and hidden files
+stay as they are.
 
-Afterwards all scenes but the last are let go, and the store is to hold what its manifests say, to the byte.
+Afterwards all scenes but the last are let go, and the store is to hold what its manifests say, to
+the byte.
 """
 
 from __future__ import annotations
@@ -68,7 +70,9 @@ def runs(work: Path, count: int) -> list[Count]:
     for number in range(count):
         stage, began = "sfm" if number % WHOLE else "export", time.monotonic()
         planner = Planner()
-        plan = planner.plan("toy", SET.format(seed=0).replace("max_points=200", f"max_points={200 + number}"))
+        plan = planner.plan(
+            "toy", SET.format(seed=0).replace("max_points=200", f"max_points={200 + number}")
+        )
         planner.save()
         with redirect_stdout(sys.stderr):
             if code := execute([plan], stage, 2):
@@ -101,9 +105,15 @@ def sizes(work: Path) -> tuple[int, int]:
     """Bytes that lie in the store, and that its manifests name."""
     named = 0
     for path in work.glob("store/*/*"):
-        named += sum(entry["bytes"] for entry in parse_manifest(path).files.values()) + (path / MANIFEST).stat().st_size
+        named += (
+            sum(entry["bytes"] for entry in parse_manifest(path).files.values())
+            + (path / MANIFEST).stat().st_size
+        )
     return sum(path.stat().st_size for path in (work / "store").rglob("*") if path.is_file()), named
 
 
 if __name__ == "__main__":
-    json.dump([asdict(row) for row in runs(Path(os.environ["CHEBSPLAT_WORK"]), int(sys.argv[1]))], sys.stdout)
+    json.dump(
+        [asdict(row) for row in runs(Path(os.environ["CHEBSPLAT_WORK"]), int(sys.argv[1]))],
+        sys.stdout,
+    )

@@ -1,4 +1,6 @@
-"""The smallest runs that have every kind of writer in them, and what is to be known of their processes and files."""
+"""The smallest runs that have every kind of writer in them, and what is to be known of their
+processes and files.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ class Run:
             self.words = self.work.with_name(f"{self.work.name}.stderr")
         command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "run", "--scene", "toy"]
         command += ["--set", SET.format(seed=self.seed), "--stage", self.stage, "--cores", "2"]
-        environment = os.environ | {"CHEBSPLAT_WORK": str(self.work), MARKER: self.mark} | self.environment
+        environment = (
+            os.environ | {"CHEBSPLAT_WORK": str(self.work), MARKER: self.mark} | self.environment
+        )
         with self.words.open("wb") as stderr:
             self.process = subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True,
                                             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
@@ -54,7 +58,11 @@ class Run:
 
     def alive(self) -> list[int]:
         """Processes of the run, zombies aside."""
-        return [number for number in marked(self.mark) if number != self.process.pid or self.process.poll() is None]
+        return [
+            number
+            for number in marked(self.mark)
+            if number != self.process.pid or self.process.poll() is None
+        ]
 
     def jobs(self) -> list[int]:
         return [number for number in self.alive() if " job " in command_line(number)]
@@ -84,7 +92,12 @@ def marked(mark: str) -> list[int]:
 
 def command_line(number: int) -> str:
     with suppress(OSError):
-        return Path(f"/proc/{number}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        return (
+            Path(f"/proc/{number}/cmdline")
+            .read_bytes()
+            .replace(b"\0", b" ")
+            .decode(errors="replace")
+        )
     return ""
 
 
@@ -114,7 +127,9 @@ def hidden(work: Path) -> list[Path]:
 
 
 def contents(work: Path) -> dict[str, str]:
-    """sha256 of every member of every artifact, those that hold seconds aside. Raises InputError on a half one."""
+    """sha256 of every member of every artifact, those that hold seconds aside. Raises InputError on
+    a half one.
+    """
     found = {}
     for path in artifacts(work):
         manifest = artifact.verify(path)

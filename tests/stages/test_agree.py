@@ -80,7 +80,8 @@ def test_a_point_behind_a_surface_is_hidden_and_one_on_it_is_not(with_depth):
 
 def test_a_sloping_floor_without_depth_does_not_hide_itself():
     u, v = np.meshgrid(np.arange(0, 640, 6.0), np.arange(340, 480, 6.0))
-    floor = np.stack([u.ravel(), v.ravel(), 500 * 1.5 / (v.ravel() - 240)], 1)  # seen from 1.5 m above
+    # seen from 1.5 m above
+    floor = np.stack([u.ravel(), v.ravel(), 500 * 1.5 / (v.ravel() - 240)], 1)
     assert unhidden(floor, (640, 480)).mean() > 0.6
 
 
@@ -94,16 +95,21 @@ def test_the_stage_warns_of_a_teacher_that_says_one_thing_and_records_it(tmp_pat
     found, facts = ViewAgreement.read(tmp_path / "out"), read_manifest(tmp_path / "out").facts
     assert found.agreement == facts["agreement"] == 0
     assert 0 < found.n_points <= N and list(found.labels) == LABELS[:1]
-    told = [line for line in capsys.readouterr().err.splitlines() if "does not know this scene" in line]
+    told = [
+        line for line in capsys.readouterr().err.splitlines() if "does not know this scene" in line
+    ]
     assert len(told) == 1 and facts["doubt"] in told[0] and "docs/teachers.md" in told[0]
     assert run_stage("agree", tmp_path / "calm", inputs, {"agree": {"low": 0.0}}) == 0
     assert "doubt" not in read_manifest(tmp_path / "calm").facts
 
 
 @pytest.mark.parametrize(
-    ("confidence", "output", "warned"), [(0.4, "logits", True), (0.9, "logits", False), (0.4, "features", False)]
+    ("confidence", "output", "warned"),
+    [(0.4, "logits", True), (0.9, "logits", False), (0.4, "features", False)],
 )
-def test_a_segmenter_that_is_unsure_of_what_views_agree_on_is_warned_of(tmp_path, capsys, confidence, output, warned):
+def test_a_segmenter_that_is_unsure_of_what_views_agree_on_is_warned_of(
+    tmp_path, capsys, confidence, output, warned
+):
     """Stripes of two labels agree better than chance."""
     small = Features.read(artifacts() / "teacher")
     stripes = np.arange(small.features.shape[2], dtype=np.int16) % 2
@@ -130,9 +136,14 @@ def test_points_that_no_two_views_see_leave_the_figure_open(tmp_path, capsys):
 
 
 def test_tracks_tell_who_sees_a_point_where_there_is_no_depth(tmp_path):
-    blind = published(tmp_path / "capture", replace(Capture.read(artifacts() / "ingest"), depth=None))
+    blind = published(
+        tmp_path / "capture", replace(Capture.read(artifacts() / "ingest"), depth=None)
+    )
     tracks = np.array([[0, 1], [0, 2], [1, 1], [2, 0], [2, 2]], np.int32)  # view 0 is a test view
-    tracked = published(tmp_path / "tracked", replace(Points.read(artifacts() / "sfm"), tracks=tracks))
+    tracked = published(
+        tmp_path / "tracked", replace(Points.read(artifacts() / "sfm"), tracks=tracks)
+    )
     inputs = {"capture": blind, "points": tracked, "features": artifacts() / "teacher"}
     assert run_stage("agree", tmp_path / "out", inputs, {}) == 0
-    assert ViewAgreement.read(tmp_path / "out").n_points == 1  # of the three, one is in two training views
+    # of the three, one is in two training views
+    assert ViewAgreement.read(tmp_path / "out").n_points == 1

@@ -1,4 +1,6 @@
-"""The channels are the teacher's: every scene of a teacher shares them, and nothing of a scene changes them."""
+"""The channels are the teacher's: every scene of a teacher shares them, and nothing of a scene
+changes them.
+"""
 
 import hashlib
 import shutil
@@ -27,13 +29,21 @@ def tiny(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     mixing = np.linalg.qr(rng.normal(size=(6, 6)))[0][:, :3]
     model = color_teacher(tmp_path, weights=mixing)
-    write_table(tmp_path / "tiny.npz", embeddings=np.array([[1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) @ mixing.T)
+    write_table(
+        tmp_path / "tiny.npz",
+        embeddings=np.array([[1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) @ mixing.T,
+    )
     return model, color_reference(tmp_path / "reference")
 
 
 def reduced(tmp_path, model, reference, **settings):
-    values = {"model": str(model), "reference": None if reference is None else str(reference)} | settings
-    code = run_stage("channels", tmp_path / "out", {}, {"channels": {k: v for k, v in values.items() if v}})
+    values = {
+        "model": str(model),
+        "reference": None if reference is None else str(reference),
+    } | settings
+    code = run_stage(
+        "channels", tmp_path / "out", {}, {"channels": {k: v for k, v in values.items() if v}}
+    )
     return code, ChannelMap.read(tmp_path / "out") if code == 0 else None
 
 
@@ -42,7 +52,11 @@ def test_a_teacher_is_reduced_to_the_channels_that_its_features_span(tmp_path, t
     assert code == 0
     assert found.matrix.shape == (6, 3)
     assert found.energy[2] == pytest.approx(1)
-    assert (found.notes["n_pixels"], found.notes["n_words"], found.notes["n_images"]) == (2 * 12 * 16, 3, 2)
+    assert (found.notes["n_pixels"], found.notes["n_words"], found.notes["n_images"]) == (
+        2 * 12 * 16,
+        3,
+        2,
+    )
     facts = read_manifest(tmp_path / "out", ChannelMap.SCHEMA).facts
     assert (facts["n_channels"], facts["of"], facts["label_agreement"]) == (3, 6, 1.0)
     assert facts["relative_error"] < 1e-3
@@ -69,7 +83,9 @@ def test_a_teacher_without_a_table_is_reduced_by_energy_alone(tmp_path, tiny):
     assert facts["n_words"] == 0
 
 
-def test_a_map_beside_its_teacher_is_taken_as_long_as_it_is_of_the_same_files_and_settings(tmp_path, tiny):
+def test_a_map_beside_its_teacher_is_taken_as_long_as_it_is_of_the_same_files_and_settings(
+    tmp_path, tiny
+):
     model, reference = tiny
     _, computed = reduced(tmp_path, model, reference)
     brought = model.with_suffix(".channels")
@@ -81,7 +97,10 @@ def test_a_map_beside_its_teacher_is_taken_as_long_as_it_is_of_the_same_files_an
         facts = read_manifest(tmp_path / "out", ChannelMap.SCHEMA).facts
         assert ("reference images" in facts.get("left_out", {})) == is_taken
         assert (facts["n_channels"], facts["n_images"]) == (3, 2)
-        assert np.array_equal(found.matrix, computed.matrix) and found.notes["digest"] == facts["digest"]
+        assert (
+            np.array_equal(found.matrix, computed.matrix)
+            and found.notes["digest"] == facts["digest"]
+        )
         shutil.rmtree(tmp_path / "out")
         settings.write_text(settings.read_text() + "# another teacher from here on")
     _, fewer = reduced(tmp_path, model, reference, n_channels=2)
@@ -108,12 +127,17 @@ def test_the_embedded_teacher_brings_its_map():
 def test_the_map_that_ships_is_what_its_stage_computes(tmp_path, monkeypatch):
     monkeypatch.setattr(channels, "shipped", lambda *_: None)
     assert run_stage("channels", tmp_path / "out", {}, {}) == 0
-    computed, brought = ChannelMap.read(tmp_path / "out"), ChannelMap.read(read_teacher(EMBEDDED).channels)
+    computed, brought = (
+        ChannelMap.read(tmp_path / "out"),
+        ChannelMap.read(read_teacher(EMBEDDED).channels),
+    )
     assert np.abs(computed.matrix - brought.matrix).max() < 1e-5
     assert computed.notes == brought.notes
 
 
-@pytest.mark.parametrize("bad", ["empty folder", "not an image", "other channels", "zero word", "closed set"])
+@pytest.mark.parametrize(
+    "bad", ["empty folder", "not an image", "other channels", "zero word", "closed set"]
+)
 def test_what_cannot_be_reduced_is_named(tmp_path, tiny, bad, capsys):
     model, reference = tiny
     named = reference
@@ -136,7 +160,10 @@ def test_what_cannot_be_reduced_is_named(tmp_path, tiny, bad, capsys):
 
 
 def test_the_reference_rooms_are_the_same_every_time():
-    digests = [[hashlib.sha256(image.tobytes()).digest() for _, image in generated(range(8000, 8001))] for _ in "ab"]
+    digests = [
+        [hashlib.sha256(image.tobytes()).digest() for _, image in generated(range(8000, 8001))]
+        for _ in "ab"
+    ]
     assert digests[0] == digests[1]
     assert len(set(digests[0])) == len(digests[0]) > 1
 
@@ -149,13 +176,22 @@ def test_scenes_share_channels_which_only_their_teacher_changes(tmp_path, tiny):
     planner, (model, reference) = Planner(), tiny
     settings = f"teacher.kind=onnx,teacher.model={model}"
     shared = key(planner, "toy", settings)
-    changes = ["source.seed=7", "ingest.test_every=5", "train.steps=9", "teacher.downscale=8", "teacher.flips=true"]
+    changes = [
+        "source.seed=7",
+        "ingest.test_every=5",
+        "train.steps=9",
+        "teacher.downscale=8",
+        "teacher.flips=true",
+    ]
     assert {key(planner, scene, settings) for scene in ("office0", "room0")} == {shared}
     assert {key(planner, "toy", f"{settings},{change}") for change in changes} == {shared}
     assert key(planner, "toy", f"{settings},channels.n_channels=2") != shared
     of_photos = key(planner, "toy", f"{settings},channels.reference={reference}")
     (reference / f"again{SUFFIXES[-1]}").write_bytes((reference / "0.png").read_bytes())
-    assert len({shared, of_photos, key(planner, "toy", f"{settings},channels.reference={reference}")}) == 3
+    assert (
+        len({shared, of_photos, key(planner, "toy", f"{settings},channels.reference={reference}")})
+        == 3
+    )
     before = key(planner, "toy", settings, "teacher")
     write_table(tmp_path / "tiny.npz", embeddings=np.eye(3, 6))
     assert key(planner, "toy", settings) != shared

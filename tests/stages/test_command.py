@@ -1,4 +1,6 @@
-"""A stage command publishes one artifact, prints its path and nothing else, and ends with the documented exit code."""
+"""A stage command publishes one artifact, prints its path and nothing else, and ends with the
+documented exit code.
+"""
 
 import json
 import logging

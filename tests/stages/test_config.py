@@ -99,7 +99,11 @@ def test_types_are_strict_and_no_number_is_infinite(value):
 
 
 def test_a_message_is_one_short_line():
-    for values in ({"train": dict.fromkeys(map(str, range(10_000)), 1)}, {"train": [0] * 10_000}, {"a\nb" * 999: 1}):
+    for values in (
+        {"train": dict.fromkeys(map(str, range(10_000)), 1)},
+        {"train": [0] * 10_000},
+        {"a\nb" * 999: 1},
+    ):
         with pytest.raises(ConfigError) as error:
             config.build(values, "x.toml")
         assert len(str(error.value)) < 300 and "\n" not in str(error.value)

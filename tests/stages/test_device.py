@@ -1,4 +1,6 @@
-"""A GPU computes where it answers, and torch's CUDA and gsplat are there; where one is missing, the CPU says so."""
+"""A GPU computes where it answers, and torch's CUDA and gsplat are there; where one is missing, the
+CPU says so.
+"""
 
 import json
 import re
@@ -26,7 +28,9 @@ LACKS = {
 
 @pytest.fixture
 def machine(tmp_path, monkeypatch):
-    """Makes this machine one with or without an NVIDIA driver, CUDA in torch, a GPU that answers, and gsplat."""
+    """Makes this machine one with or without an NVIDIA driver, CUDA in torch, a GPU that answers,
+    and gsplat.
+    """
 
     def make(driver=True, lacks=""):
         if driver:
@@ -34,7 +38,9 @@ def machine(tmp_path, monkeypatch):
         monkeypatch.setattr(device, "DRIVER", tmp_path / "version")
         monkeypatch.setattr(torch.version, "cuda", None if lacks == "CUDA" else "13.0")
         monkeypatch.setattr(torch.cuda, "is_available", lambda: lacks not in ("CUDA", "GPU"))
-        monkeypatch.setitem(sys.modules, "gsplat", None if lacks == "gsplat" else types.SimpleNamespace())
+        monkeypatch.setitem(
+            sys.modules, "gsplat", None if lacks == "gsplat" else types.SimpleNamespace()
+        )
 
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path / "work"))
     monkeypatch.chdir(ROOT)
@@ -66,7 +72,9 @@ def test_a_machine_without_a_driver_is_not_asked_unless_cuda_is_asked_for(machin
 
 def test_a_stage_runs_and_its_manifest_names_what_computed(machine, tmp_path):
     machine(lacks="gsplat")
-    (tmp_path / "toy.json").write_text(json.dumps({"source": {"kind": "generated", "preset": "toy", "seed": 1}}))
+    (tmp_path / "toy.json").write_text(
+        json.dumps({"source": {"kind": "generated", "preset": "toy", "seed": 1}})
+    )
     command = ["ingest", "--config", str(tmp_path / "toy.json"), "--out", str(tmp_path / "capture")]
     assert CliRunner().invoke(main, [*command, "--device", "cuda"]).exit_code == 2
     assert not (tmp_path / "capture").exists()
@@ -86,10 +94,14 @@ def test_a_run_says_it_once_for_all_its_stages(machine):
 
 
 def test_the_device_is_in_the_keys_of_what_it_computes_and_of_all_that_follows(quick_plans):
-    on_cpu, on_gpu = ({step.stage: step for step in Planner(device=name).plan("toy").steps} for name in ("cpu", "cuda"))
+    on_cpu, on_gpu = (
+        {step.stage: step for step in Planner(device=name).plan("toy").steps}
+        for name in ("cpu", "cuda")
+    )
     same = {stage for stage in on_cpu if on_cpu[stage].key == on_gpu[stage].key}
     assert same == {"ingest", "sfm", "teacher", "agree"}
     computing = {step.stage: entry(step, {}, "cuda")["device"] for step in on_gpu.values()}
     assert {stage for stage, used in computing.items() if used == "cuda"} == {"train", "evaluate"}
     seen = {step.stage: step for step in Planner(device="cuda").plan("office0").steps}
-    assert entry(seen["teacher"], {}, "cuda")["device"] == "cuda"  # a model runs there; labels with noise do not
+    # a model runs there; labels with noise do not
+    assert entry(seen["teacher"], {}, "cuda")["device"] == "cuda"

@@ -58,10 +58,16 @@ def pictures(count=3, side=24):
 
 @pytest.mark.parametrize(
     "names",
-    [("features.{}", "lin{}.model.1"), ("net.slice1.{}", "lins.{}.model.1"), ("net.layers.{}", "lin.{}.1")],
+    [
+        ("features.{}", "lin{}.model.1"),
+        ("net.slice1.{}", "lins.{}.model.1"),
+        ("net.layers.{}", "lin.{}.1"),
+    ],
 )
 def test_lpips_of_weights_that_pass_colours_on_is_the_distance_of_their_directions(names):
-    """Every layer keeps the first three channels; so each tap compares the unit vectors of the scaled colours."""
+    """Every layer keeps the first three channels; so each tap compares the unit vectors of the
+    scaled colours.
+    """
     layers, taps = widths()
     state = {}
     for layer, inputs, outputs in layers:
@@ -76,13 +82,16 @@ def test_lpips_of_weights_that_pass_colours_on_is_the_distance_of_their_directio
     a, b = (np.full((32, 32, 3), color, np.uint8) for color in ((200, 10, 60), (30, 90, 255)))
     units = []
     for image in (a, b):
-        color = np.maximum((image[0, 0] / 255 - SHIFT) / SCALE, 0)  # in [0, 1]: not scaled to [-1, 1]
+        # in [0, 1]: not scaled to [-1, 1]
+        color = np.maximum((image[0, 0] / 255 - SHIFT) / SCALE, 0)
         units.append(color / np.linalg.norm(color))
     wanted = (1 + 2 + 3 + 4 + 5) * (np.array([1, 2, 3]) * (units[0] - units[1]) ** 2).sum()
     assert Lpips(state).distance(a, b) == pytest.approx(wanted, rel=1e-4)
 
 
-def test_weights_of_lpips_are_read_from_both_kinds_of_file_and_wrong_ones_are_named(weights, tmp_path):
+def test_weights_of_lpips_are_read_from_both_kinds_of_file_and_wrong_ones_are_named(
+    weights, tmp_path
+):
     a, b, _ = pictures()
     save_file(weights, tmp_path / "vgg.safetensors")
     torch.save(weights, tmp_path / "vgg.pth")
@@ -91,7 +100,8 @@ def test_weights_of_lpips_are_read_from_both_kinds_of_file_and_wrong_ones_are_na
     damaged = {
         "no tensor lin3": {name: t for name, t in weights.items() if not name.startswith("lin3")},
         r"features.5.bias is \(64,\), not \(128,\)": weights | {"features.5.bias": torch.zeros(64)},
-        "features.0.weight is not finite": weights | {"features.0.weight": torch.full((64, 3, 3, 3), torch.nan)},
+        "features.0.weight is not finite": weights
+        | {"features.0.weight": torch.full((64, 3, 3, 3), torch.nan)},
         "no tensor features.0.weight": {"a": torch.zeros(1)},
     }
     for message, state in damaged.items():
@@ -119,7 +129,9 @@ def test_what_is_masked_counts_in_no_image_figure_and_no_lpips_is_none(weights):
 
 
 @pytest.mark.xdist_group("toy")
-def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_undistorted_photos_are_named(toy, tmp_path):
+def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_undistorted_photos_are_named(
+    toy, tmp_path
+):
     capture = Capture.read(toy["ingest"])
     capture.loss_mask = np.ones(capture.images.shape[:3], bool)
     capture.loss_mask[np.flatnonzero(capture.is_test)[0]] = False
@@ -133,25 +145,34 @@ def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_undistorted_pho
     assert "no pixel" in found["left_out"][f"1 of {n} views"]
     assert "as_taken" not in found["image"]  # its capture holds none
     timed = {"evaluation": "A", "gaussians": "B"}
-    rows = [summary_rows(figures, None, {"milliseconds": {}}, timed)[1][0] for figures in (whole, found)]
+    rows = [
+        summary_rows(figures, None, {"milliseconds": {}}, timed)[1][0] for figures in (whole, found)
+    ]
     assert "undistorted" not in rows[0] and "of undistorted photos" in rows[1]
 
 
 @pytest.mark.xdist_group("toy")
 def test_lpips_given_weights_and_the_time_by_part_are_in_the_evaluation(toy, weights, tmp_path):
     save_file(weights, tmp_path / "vgg.safetensors")
-    config = changed(evaluate={"lpips_weights": str(tmp_path / "vgg.safetensors"), "timing_repeats": 1})
+    config = changed(
+        evaluate={"lpips_weights": str(tmp_path / "vgg.safetensors"), "timing_repeats": 1}
+    )
     assert run_stage("evaluate", tmp_path / "out", inputs_of(toy, "evaluate"), config) == 0
     figures = Evaluation.read(tmp_path / "out").figures
     assert figures["lpips"] > 0 and figures["lpips_net"] == {"net": "vgg", "normalize": False}
     assert "LPIPS" not in figures["left_out"]
     split = figures["milliseconds"]
     assert all(split[part] > 0 for part in ("projection", "sh", "sort", "blend"))
-    assert (split["width"], split["height"], split["device"]) == (96, 72, "cpu") and split["threads"] >= 1
+    assert (split["width"], split["height"], split["device"]) == (96, 72, "cpu") and split[
+        "threads"
+    ] >= 1
     config = changed(evaluate={"timing_repeats": 0})
     assert run_stage("evaluate", tmp_path / "untimed", inputs_of(toy, "evaluate"), config) == 0
     untimed = Evaluation.read(tmp_path / "untimed").figures
-    assert untimed["frames_per_second"] == untimed["milliseconds"] == {} and "frames a second" in untimed["left_out"]
+    assert (
+        untimed["frames_per_second"] == untimed["milliseconds"] == {}
+        and "frames a second" in untimed["left_out"]
+    )
     without = Evaluation.read(toy["evaluate"]).figures
     assert without["lpips"] is None and "not measured" in without["left_out"]["LPIPS"]
 
@@ -173,7 +194,9 @@ def test_a_finer_view_is_blurred_as_what_was_trained_on(toy):
         view = camera(scene, 0)
         picture = renderer.render(view)[0].astype(float)
         fine = renderer.render(enlarged(view, 3))[0].astype(float)
-        far.append(np.abs(fine.reshape(view.height, 3, view.width, 3, 3).mean((1, 3)) - picture).mean())
+        far.append(
+            np.abs(fine.reshape(view.height, 3, view.width, 3, 3).mean((1, 3)) - picture).mean()
+        )
     assert far[0] < 0.85 * far[1]  # grey levels
 
 
@@ -214,10 +237,17 @@ def test_points_are_measured_where_depth_and_poses_say_where_they_lie(toy, tmp_p
 
 
 @pytest.mark.xdist_group("toy")
-def test_names_are_matched_however_they_are_spelt_and_the_end_of_a_run_lists_what_matches_nothing(toy, tmp_path):
-    record, wanted = Capture.read(toy["ingest"]), Evaluation.read(toy["evaluate"]).figures["segmentation"]
+def test_names_are_matched_however_they_are_spelt_and_the_end_of_a_run_lists_what_matches_nothing(
+    toy, tmp_path
+):
+    record, wanted = (
+        Capture.read(toy["ingest"]),
+        Evaluation.read(toy["evaluate"]).figures["segmentation"],
+    )
     own = record.class_names
-    for k, names in enumerate(([name.upper().replace("-", "_") for name in own], ["my own word", *own[1:]])):
+    for k, names in enumerate(
+        ([name.upper().replace("-", "_") for name in own], ["my own word", *own[1:]])
+    ):
         record.class_names = names
         inputs = inputs_of(toy, "evaluate") | {"capture": published(tmp_path / f"c{k}", record)}
         assert run_stage("evaluate", tmp_path / f"out{k}", inputs) == 0
@@ -250,11 +280,19 @@ def test_a_truth_of_one_class_gives_no_miou_and_says_why(toy, tmp_path):
 def test_a_scannet_scene_runs_from_its_folder_to_the_figures_of_scannet_open(tmp_path):
     """All 16 views are trained on and evaluated; points come from the scene's own file."""
     fields = generated.capture("toy", 1, "toy")
-    fields["labels"], fields["class_names"] = (fields["labels"] + 7) % 20, list(scannet_open.CLASSES)
+    fields["labels"], fields["class_names"] = (
+        (fields["labels"] + 7) % 20,
+        list(scannet_open.CLASSES),
+    )
     pixels = np.argwhere(np.ones((72, 96), bool))[::17]
-    parts = [unproject(fields["depth"][k], fields["Ks"][k], fields["cam_from_world"][k], pixels) for k in range(16)]
+    parts = [
+        unproject(fields["depth"][k], fields["Ks"][k], fields["cam_from_world"][k], pixels)
+        for k in range(16)
+    ]
     fields["points"] = np.concatenate(parts).astype(np.float32)
-    fields["point_colors"] = np.concatenate([image[pixels[:, 0], pixels[:, 1]] for image in fields["images"]])
+    fields["point_colors"] = np.concatenate(
+        [image[pixels[:, 0], pixels[:, 1]] for image in fields["images"]]
+    )
     folder = tmp_path / "scene0000_00"
     layouts.write_scannet_sg(folder, fields)
     config = changed(source={"kind": "scannet", "path": str(folder)}, ingest={"protocol": "scannet-open"},
@@ -267,7 +305,10 @@ def test_a_scannet_scene_runs_from_its_folder_to_the_figures_of_scannet_open(tmp
     assert artifact.read_manifest(made["sfm"]).facts["how"] == "source"
     figures = Evaluation.read(made["evaluate"]).figures
     assert len(figures["names"]) == 16
-    assert (figures["protocol"]["name"], figures["protocol"]["resolution"]) == ("scannet-open", "96x72")
+    assert (figures["protocol"]["name"], figures["protocol"]["resolution"]) == (
+        "scannet-open",
+        "96x72",
+    )
     matrix = np.array(figures["segmentation"]["scene"]["confusion"])
     assert matrix.shape == (20, 20) and matrix.sum() == 16 * 484 * 648
     assert figures["segmentation"]["teacher"]["miou"] > 0.3
@@ -279,7 +320,9 @@ def test_the_content_of_the_weights_is_part_of_what_an_evaluation_is(quick_plans
     for content in (b"one", b"other"):
         (tmp_path / "vgg.pth").write_bytes(content)
         plans.append(Planner().plan("toy", "evaluate.lpips_weights=vgg.pth"))
-    changed = [a.stage for a, b in zip(plans[0].steps, plans[1].steps, strict=True) if a.key != b.key]
+    changed = [
+        a.stage for a, b in zip(plans[0].steps, plans[1].steps, strict=True) if a.key != b.key
+    ]
     assert changed == ["evaluate", "report"]
     with pytest.raises(InputError, match=r"gone\.pth is missing"):
         Planner().plan("toy", "evaluate.lpips_weights=gone.pth")
@@ -296,7 +339,9 @@ def test_a_scannet_folder_is_planned_without_the_stages_it_does_not_need(quick_p
     assert "sfm: matching" in plan.left_out
     assert (
         "sfm: matching"
-        not in Planner().plan("./scene0000_00", "ingest.protocol=scannet-closed,ingest.depth=off").left_out
+        not in Planner()
+        .plan("./scene0000_00", "ingest.protocol=scannet-closed,ingest.depth=off")
+        .left_out
     )
     (tmp_path / "scene0000_00/splits.json").write_text('{"train": ["0"], "test": ["10"]}')
     again = Planner().plan("./scene0000_00", "ingest.protocol=scannet-closed")

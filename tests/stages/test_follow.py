@@ -1,4 +1,6 @@
-"""A training's progress line is steady and says what it shows; a training that is stopped saves its state first."""
+"""A training's progress line is steady and says what it shows; a training that is stopped saves its
+state first.
+"""
 
 import os
 import signal

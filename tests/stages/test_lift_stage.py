@@ -1,4 +1,6 @@
-"""Lifted features of small artifacts: of a checkpoint, in an export, and of a PLY that came from elsewhere."""
+"""Lifted features of small artifacts: of a checkpoint, in an export, and of a PLY that came from
+elsewhere.
+"""
 
 import numpy as np
 import pytest
@@ -25,7 +27,15 @@ ROLES = {"capture": "ingest", "gaussians": "train", "features": "teacher"}
 
 @pytest.fixture
 def lifted(tmp_path):
-    assert run_stage("lift", tmp_path / "lift", {role: artifacts() / name for role, name in ROLES.items()}, {}) == 0
+    assert (
+        run_stage(
+            "lift",
+            tmp_path / "lift",
+            {role: artifacts() / name for role, name in ROLES.items()},
+            {},
+        )
+        == 0
+    )
     return tmp_path / "lift"
 
 
@@ -35,7 +45,11 @@ def test_only_training_views_are_lifted_and_the_export_has_what_was(lifted, tmp_
     assert held.n_views.max() <= 2
     assert held.features.shape == (N, 5)
     np.testing.assert_array_equal(held.half_views.sum(0), held.n_views)
-    inputs = {"gaussians": artifacts() / "train", "features": artifacts() / "teacher", "lifted": lifted}
+    inputs = {
+        "gaussians": artifacts() / "train",
+        "features": artifacts() / "teacher",
+        "lifted": lifted,
+    }
     assert run_stage("export", tmp_path / "export", inputs, {}) == 0
     scene, unseen = Scene.read(tmp_path / "export"), ~held.features.any(1)
     assert unseen.any() and not unseen.all()
@@ -47,7 +61,9 @@ def test_a_ply_gets_what_its_checkpoint_gets_and_becomes_a_folder_of_artifacts(l
     parameters = Gaussians.read(artifacts() / "train").parameters
     write_ply(tmp_path / "a.ply", parameters, 0)
     out = tmp_path / "out"
-    figures = lift_ply(tmp_path / "a.ply", artifacts() / "ingest", None, artifacts() / "teacher", None, out)
+    figures = lift_ply(
+        tmp_path / "a.ply", artifacts() / "ingest", None, artifacts() / "teacher", None, out
+    )
     assert figures["gaussians"] == N
     np.testing.assert_array_equal(Lifted.read(out / "lift").features, Lifted.read(lifted).features)
     assert Scene.read(out / "export").labels is not None
@@ -55,9 +71,18 @@ def test_a_ply_gets_what_its_checkpoint_gets_and_becomes_a_folder_of_artifacts(l
 
 def test_a_splat_in_another_frame_and_a_capture_without_poses_are_refused(tmp_path):
     parameters = Gaussians.read(artifacts() / "train").parameters
-    write_ply(tmp_path / "far.ply", parameters | {"means": parameters["means"] + np.float32(1000)}, 0)
+    write_ply(
+        tmp_path / "far.ply", parameters | {"means": parameters["means"] + np.float32(1000)}, 0
+    )
     with pytest.raises(DataFailure, match="same frame"):
-        lift_ply(tmp_path / "far.ply", artifacts() / "ingest", None, artifacts() / "teacher", None, tmp_path / "far")
+        lift_ply(
+            tmp_path / "far.ply",
+            artifacts() / "ingest",
+            None,
+            artifacts() / "teacher",
+            None,
+            tmp_path / "far",
+        )
     record = Capture.read(artifacts() / "ingest")
     record.cam_from_world = None
     posed, features = published(tmp_path / "capture", record), artifacts() / "teacher"
@@ -84,7 +109,11 @@ def test_the_command_is_a_stage_without_a_file_and_a_use_with_one():
     runner = CliRunner()
     assert "--in-gaussians" in runner.invoke(main, ["lift", "--help"]).output
     context = click.Context(main)
-    assert {p.name for p in main.resolve_command(context, ["lift", "a.ply"])[1].params} >= {"ply", "capture", "out"}
+    assert {p.name for p in main.resolve_command(context, ["lift", "a.ply"])[1].params} >= {
+        "ply",
+        "capture",
+        "out",
+    }
     listed = main.list_commands(context)
     assert listed.count("lift") == 1
 
@@ -103,9 +132,13 @@ def test_features_of_a_training_start_as_what_the_views_say_of_its_gaussians(up_
         taught = views.features(k)
         rendered = model.render(views.camera(k, 1), 0, masked=False, grid=taught.shape[:2]).features
         maps = rendered.detach().numpy(), taught.numpy()
-        named, wanted = (decode_labels(each.reshape(-1, each.shape[-1]), features.label_embeddings) for each in maps)
+        named, wanted = (
+            decode_labels(each.reshape(-1, each.shape[-1]), features.label_embeddings)
+            for each in maps
+        )
         shares.append((named == wanted).mean())
-    assert np.median(shares) > 0.75  # in some views the teacher is wrong about a whole wall, which the others outvote
+    # in some views the teacher is wrong about a whole wall, which the others outvote
+    assert np.median(shares) > 0.75
 
 
 def test_features_start_at_nothing_where_no_view_says_anything(up_to_teacher):

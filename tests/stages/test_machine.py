@@ -14,10 +14,19 @@ from chebsplat.stages.runtime import machine
 from chebsplat.stages.runtime.command import publish
 from chebsplat.stages.training import saves
 
-MACHINE = {"processor": "A", "gpu": "", "cores": 8, "threads": 2, "load": [0.5, 2.0], "seconds": 100.0}
+MACHINE = {
+    "processor": "A",
+    "gpu": "",
+    "cores": 8,
+    "threads": 2,
+    "load": [0.5, 2.0],
+    "seconds": 100.0,
+}
 
 
-def test_a_manifest_says_on_what_its_seconds_were_measured_and_its_key_does_not(tmp_path, monkeypatch):
+def test_a_manifest_says_on_what_its_seconds_were_measured_and_its_key_does_not(
+    tmp_path, monkeypatch
+):
     made = []
     for name in ("A", "B"):
         monkeypatch.setattr(machine, "processor", lambda name=name: name)
@@ -27,7 +36,9 @@ def test_a_manifest_says_on_what_its_seconds_were_measured_and_its_key_does_not(
     for name, manifest in zip("AB", made, strict=True):
         (process,) = manifest.processes
         assert (process["processor"], process["cores"]) == (name, len(os.sched_getaffinity(0)))
-        assert process["threads"] == manifest.threads and manifest.seconds == process["seconds"] >= 0
+        assert (
+            process["threads"] == manifest.threads and manifest.seconds == process["seconds"] >= 0
+        )
         assert len(process["load"]) == 2 and min(process["load"]) >= 0
         assert measured_on(manifest).startswith(f"{name}, {manifest.threads} thread")
     assert made[0].versions.keys() >= {"numpy", "python"}
@@ -48,7 +59,9 @@ def test_machines_are_the_same_where_their_names_and_threads_are(processes, word
 
 
 @pytest.mark.parametrize("lines", [None, "CPU part\t: 0xd0c\n", "model name\t:\n"])
-def test_a_processor_without_a_name_is_told_from_others_of_its_architecture(tmp_path, monkeypatch, lines):
+def test_a_processor_without_a_name_is_told_from_others_of_its_architecture(
+    tmp_path, monkeypatch, lines
+):
     monkeypatch.setattr(machine, "CPUS", tmp_path / "cpuinfo")
     monkeypatch.setattr("llvmlite.binding.get_host_cpu_name", lambda: "neoverse-n1")
     if lines is not None:
@@ -80,12 +93,17 @@ def test_what_is_begun_anew_counts_no_process_before_it(tmp_path, caplog):
 
 
 @pytest.mark.xdist_group("toy")
-@pytest.mark.parametrize("stage", ["train", "teacher", pytest.param("teach", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "stage", ["train", "teacher", pytest.param("teach", marks=pytest.mark.slow)]
+)
 def test_a_resumed_stage_has_the_seconds_of_all_its_processes(toy, tmp_path, monkeypatch, stage):
     inputs = {role: toy[of] for role, of in INPUTS[stage].items()}
     if stage == "teacher":
         inputs["channels"] = EMBEDDED.with_suffix(".channels")
-    config, out = TOY | {"teacher": {"kind": "auto"}} | artifact.read_manifest(toy["teach"]).config, tmp_path / stage
+    config, out = (
+        TOY | {"teacher": {"kind": "auto"}} | artifact.read_manifest(toy["teach"]).config,
+        tmp_path / stage,
+    )
     monkeypatch.setattr(saves, "SECONDS", 0.0)
     with monkeypatch.context() as patched:
         stopped_after(patched, *{"train": (saves.Saves, "offer", 5), "teacher": (machine.Stopwatch, "keep", 2),

@@ -1,4 +1,6 @@
-"""A splat of another frame than the cameras comes into theirs where anything tells the way; else it is refused."""
+"""A splat of another frame than the cameras comes into theirs where anything tells the way; else it
+is refused.
+"""
 
 import json
 import logging
@@ -22,8 +24,11 @@ from chebsplat.stages.sources import generated
 from chebsplat.stages.tools.lift_ply import lift_ply
 from chebsplat.stages.training.placing import in_frame
 
-ANY = Similarity(0.31, Rotation.from_rotvec([1.0, 2.0, 0.3]).as_matrix(), np.array([4.0, 0.2, -3.0]))
-COLMAPS = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # to nerfstudio's axes, as its COLMAP reader has them
+ANY = Similarity(
+    0.31, Rotation.from_rotvec([1.0, 2.0, 0.3]).as_matrix(), np.array([4.0, 0.2, -3.0])
+)
+# to nerfstudio's axes, as its COLMAP reader has them
+COLMAPS = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
 def view_of(capture):
@@ -61,17 +66,27 @@ def room():
 def nerfstudios(capture, points, prior=None):
     """`orientation up`, `center poses`, `auto scale`."""
     prior = np.eye(3) if prior is None else prior
-    eyes, up = centers(capture.cam_from_world) @ prior.T, -capture.cam_from_world[:, 1, :3].mean(0) @ prior.T
+    eyes, up = (
+        centers(capture.cam_from_world) @ prior.T,
+        -capture.cam_from_world[:, 1, :3].mean(0) @ prior.T,
+    )
     turn = Rotation.align_vectors([[0, 0, 1.0]], [up])[0]
     placed = turn.apply(eyes - eyes.mean(0))
     return moved(lambda x: turn.apply(x @ prior.T - eyes.mean(0)) / np.abs(placed).max())
 
 
 def gsplats(capture, points):
-    """`normalize_world_space`: upright, what is looked at to 0, median distance 1, then axes of the points."""
+    """`normalize_world_space`: upright, what is looked at to 0, median distance 1, then axes of the
+    points.
+    """
     turn = Rotation.align_vectors([[0, -1.0, 0]], [-capture.cam_from_world[:, 1, :3].mean(0)])[0]
-    eyes, axes = turn.apply(centers(capture.cam_from_world)), turn.apply(capture.cam_from_world[:, 2, :3])
-    middle = np.median([eye - axis * (eye @ axis) for eye, axis in zip(eyes, axes, strict=True)], axis=0)
+    eyes, axes = (
+        turn.apply(centers(capture.cam_from_world)),
+        turn.apply(capture.cam_from_world[:, 2, :3]),
+    )
+    middle = np.median(
+        [eye - axis * (eye @ axis) for eye, axis in zip(eyes, axes, strict=True)], axis=0
+    )
     scale = np.median(np.linalg.norm(eyes - middle, axis=1))
     cloud = (turn.apply(points) - middle) / scale
     frame = np.linalg.svd(cloud - cloud.mean(0), full_matrices=False)[2]
@@ -104,20 +119,26 @@ def test_a_frame_that_trainers_make_of_the_cameras_is_found_and_told(room, tmp_p
     way = make(capture, points)
     with caplog.at_level(logging.WARNING, "chebsplat"):
         given = way.of_gaussians(parameters)
-        found = in_frame(tmp_path / "a.ply", given, capture, view_of(capture), points if with_points else None)
+        found = in_frame(
+            tmp_path / "a.ply", given, capture, view_of(capture), points if with_points else None
+        )
     extent = np.ptp(parameters["means"], axis=0).max()
     off = np.linalg.norm(found["means"] - parameters["means"], axis=1) / extent
     assert np.median(off) < 0.002  # of the room's extent; points lie 1 cm off
     assert "lies in another frame than the cameras" in caplog.text
 
 
-@pytest.mark.parametrize("axes", [np.eye(3), COLMAPS, COLMAPS.T], ids=["as they are", "swapped", "swapped back"])
+@pytest.mark.parametrize(
+    "axes", [np.eye(3), COLMAPS, COLMAPS.T], ids=["as they are", "swapped", "swapped back"]
+)
 @pytest.mark.parametrize("place", [".", "run/exports/splat"])
 def test_a_file_of_nerfstudio_tells_the_way_exactly(room, tmp_path, place, axes):
     capture, parameters, _ = room
     (tmp_path / place).mkdir(parents=True, exist_ok=True)
     matrix = np.c_[ANY.rotation, ANY.shift / ANY.scale].tolist()
-    (tmp_path / "dataparser_transforms.json").write_text(json.dumps({"transform": matrix, "scale": ANY.scale}))
+    (tmp_path / "dataparser_transforms.json").write_text(
+        json.dumps({"transform": matrix, "scale": ANY.scale})
+    )
     given = ANY.after(Similarity(1.0, axes, np.zeros(3))).of_gaussians(parameters)
     found = in_frame(tmp_path / place / "a.ply", given, capture, view_of(capture), None)
     for part in ("means", "log_scales", "shN"):
@@ -151,14 +172,25 @@ def test_what_nothing_tells_the_way_of_is_refused_with_what_was_tried(room, tmp_
     with pytest.raises(
         InputError, match=r"another frame.*nerfstudio's and gsplat's.*dataparser_transforms\.json"
     ) as no:
-        in_frame(tmp_path / "a.ply", given, capture, view_of(capture), points if "scene" in what else None)
+        in_frame(
+            tmp_path / "a.ply",
+            given,
+            capture,
+            view_of(capture),
+            points if "scene" in what else None,
+        )
     assert str(tmp_path / "a.ply") in str(no.value)
 
 
-def test_a_splat_trained_little_is_taken_with_a_warning_and_few_views_or_one_colour_say_nothing(room, tmp_path, caplog):
+def test_a_splat_trained_little_is_taken_with_a_warning_and_few_views_or_one_colour_say_nothing(
+    room, tmp_path, caplog
+):
     capture, parameters, _ = room
     rng = np.random.default_rng(0)
-    few = parameters | {"means": parameters["means"] + rng.normal(0, 0.4, (len(parameters["means"]), 3)).astype("f4")}
+    few = parameters | {
+        "means": parameters["means"]
+        + rng.normal(0, 0.4, (len(parameters["means"]), 3)).astype("f4")
+    }
     with caplog.at_level(logging.WARNING, "chebsplat"):
         assert in_frame(tmp_path / "a.ply", few, capture, view_of(capture), None) is few
     assert "trained little" in caplog.text
@@ -171,7 +203,9 @@ def test_a_splat_trained_little_is_taken_with_a_warning_and_few_views_or_one_col
 
 
 @pytest.mark.xdist_group("toy")
-def test_lift_and_train_take_a_splat_of_nerfstudios_frame_as_if_it_lay_in_theirs(up_to_teacher, tmp_path):
+def test_lift_and_train_take_a_splat_of_nerfstudios_frame_as_if_it_lay_in_theirs(
+    up_to_teacher, tmp_path
+):
     capture = Capture.read(up_to_teacher / "ingest")
     parameters, _ = splat_of(capture, np.random.default_rng(0))
     way = nerfstudios(capture, None)
@@ -191,17 +225,25 @@ def test_lift_and_train_take_a_splat_of_nerfstudios_frame_as_if_it_lay_in_theirs
         inputs = {role: up_to_teacher / of for role, of in INPUTS["train"].items()}
         assert run_stage("train", tmp_path / f"{name}-train", inputs, TOY | {"train": train}) == 0
         psnr.append(Gaussians.read(tmp_path / f"{name}-train").trace[0]["psnr"])
-    alike = (features[0] * features[1]).sum(1) / np.maximum(np.linalg.norm(features[0], axis=1) ** 2, 1e-9)
+    alike = (features[0] * features[1]).sum(1) / np.maximum(
+        np.linalg.norm(features[0], axis=1) ** 2, 1e-9
+    )
     assert np.median(alike[features[0].any(1)]) > 0.999
     assert abs(psnr[0] - psnr[1]) < 0.1
 
 
 @pytest.mark.parametrize("told", ["in its source's", "by cameras", "by a file"])
-def test_in_a_scene_that_is_normalised_inside_the_way_is_found_from_the_source_world(room, tmp_path, told):
+def test_in_a_scene_that_is_normalised_inside_the_way_is_found_from_the_source_world(
+    room, tmp_path, told
+):
     capture, parameters, _ = room
     outward = Similarity(1000.0, np.eye(3), np.array([5000.0, -2000.0, 100.0]))
-    capture = replace(capture, source={"world": {"origin": outward.shift.tolist(), "scale": 1000.0}})
-    way = {"in its source's": outward, "by cameras": nerfstudios(capture, None), "by a file": ANY}[told]
+    capture = replace(
+        capture, source={"world": {"origin": outward.shift.tolist(), "scale": 1000.0}}
+    )
+    way = {"in its source's": outward, "by cameras": nerfstudios(capture, None), "by a file": ANY}[
+        told
+    ]
     if told == "by a file":
         from_source = ANY.after(outward.inverse())
         matrix = np.c_[from_source.rotation, from_source.shift / from_source.scale].tolist()

@@ -44,7 +44,9 @@ class Fetches(HTMLParser):
     def handle_starttag(self, tag, attributes):
         values = dict(attributes)
         self.fetched += [
-            v for k, v in attributes if k in ("src", "href", "xlink:href") and not v.startswith(("data:", "#"))
+            v
+            for k, v in attributes
+            if k in ("src", "href", "xlink:href") and not v.startswith(("data:", "#"))
         ]
         if tag == "img" and "data-of" in values:
             self.pictures.setdefault(values["data-of"], []).append(values["src"])
@@ -72,7 +74,10 @@ def test_the_page_tells_what_the_scene_decided(toy):
     facts = read_manifest(toy["train"]).facts["decided"]
     assert facts.keys() == DEFAULTS.keys() - {"steps"}  # which the config names
     page = (toy["report"] / "report.html").read_text()
-    assert all(f"<code>train.{name}</code>" in page and decided["by"] in page for name, decided in facts.items())
+    assert all(
+        f"<code>train.{name}</code>" in page and decided["by"] in page
+        for name, decided in facts.items()
+    )
 
 
 def test_the_page_s_pictures_are_those_of_the_evaluation(toy):
@@ -84,7 +89,9 @@ def test_the_page_s_pictures_are_those_of_the_evaluation(toy):
     assert np.abs(difference).mean() < 4  # WebP at quality 90; another view lies 30 away
     classes = Evaluation.read(toy["evaluate"]).figures["segmentation"]["classes"]
     colors = {tuple(color) for color in draw.palette(len(classes)).tolist()} | {(0, 0, 0)}
-    assert {tuple(color) for color in image(pictures["labels"][0]).reshape(-1, 3).tolist()} <= colors
+    assert {
+        tuple(color) for color in image(pictures["labels"][0]).reshape(-1, 3).tolist()
+    } <= colors
 
 
 def test_labels_are_named_by_the_capture_and_otherwise_by_the_scene(toy, tmp_path):
@@ -125,7 +132,9 @@ def test_true_classes_stand_beside_the_scene_s_labels_and_what_they_are_taken_fo
     taken = np.array([[[0, 0, 1, -1, 1, 0, 0, 2]]], np.int16)
     held.pictures = {"labels": truth, "predicted": taken}
     names = ["wall", "floor", "lamp", "bed"]
-    with publish(tmp_path / "scene", Manifest("chebsplat.scene/1", KEY, "export", {}, {}, 0)) as out:
+    with publish(
+        tmp_path / "scene", Manifest("chebsplat.scene/1", KEY, "export", {}, {}, 0)
+    ) as out:
         (out / "labels.json").write_text(json.dumps({"0": "Floor", "1": "WALL"}))
     wall, floor, lamp = beside_truth(held, names, {"scene": tmp_path / "scene"})
     assert [row["label"] for row in (wall, floor, lamp)] == ["WALL", "Floor", None]
@@ -145,8 +154,12 @@ def test_error_pictures_show_where_it_is_wrong_and_nowhere_else():
     assert wrong[..., 3].tolist() == [[0, 255], [0, 0]]
 
 
-def test_the_total_counts_every_stage_with_the_channels_and_no_size_exceeds_plain_3dgs(toy, tmp_path):
-    inputs = {role: toy[of] for role, of in INPUTS["report"].items()} | {"channels": toy["channels"]}
+def test_the_total_counts_every_stage_with_the_channels_and_no_size_exceeds_plain_3dgs(
+    toy, tmp_path
+):
+    inputs = {role: toy[of] for role, of in INPUTS["report"].items()} | {
+        "channels": toy["channels"]
+    }
     assert run_stage("report", tmp_path / "report", inputs) == 0
     text = (tmp_path / "report/report.html").read_text()
     seconds = [read_manifest(path).seconds for path in inputs.values()]
@@ -158,17 +171,28 @@ def test_the_total_counts_every_stage_with_the_channels_and_no_size_exceeds_plai
 
 def test_what_a_clock_has_measured_names_its_machine(toy, tmp_path):
     inputs = {}
-    for role, stage, processor in (("evaluation", "evaluate", "Slow 1"), ("gaussians", "train", "Fast 2")):
+    for role, stage, processor in (
+        ("evaluation", "evaluate", "Slow 1"),
+        ("gaussians", "train", "Fast 2"),
+    ):
         inputs[role] = shutil.copytree(toy[stage], tmp_path / stage)
         manifest = json.loads((inputs[role] / "artifact.json").read_text())
         manifest["config"].get("train", {})["seconds"] = 60.0
-        manifest["processes"][0] |= {"processor": processor, "threads": 3, "cores": 5, "load": [0.2, 1.9]}
+        manifest["processes"][0] |= {
+            "processor": processor,
+            "threads": 3,
+            "cores": 5,
+            "load": [0.2, 1.9],
+        }
         (inputs[role] / "artifact.json").write_text(json.dumps(manifest))
     assert run_stage("report", tmp_path / "report", inputs) == 0
     with (tmp_path / "report/figures.csv").open() as handle:
         rows = {row["figure"]: row["scene"] for row in csv.DictReader(handle)}
     assert "frames/s, colour (measured on Slow 1, 3 threads)" in rows
-    assert any(name.startswith("ms a training step") and "measured on Fast 2, 3 threads" in name for name in rows)
+    assert any(
+        name.startswith("ms a training step") and "measured on Fast 2, 3 threads" in name
+        for name in rows
+    )
     steps = Gaussians.read(toy["train"]).trace[-1]["step"]
     clock = "steps within 60 s by the clock (train.seconds, measured on Fast 2, 3 threads)"
     assert rows[clock] == f"{steps:g}"
@@ -176,7 +200,9 @@ def test_what_a_clock_has_measured_names_its_machine(toy, tmp_path):
     assert "Slow 1, 3 threads of 5 cores" in page and "0.2 to 1.9" in page and clock in page
 
 
-def test_the_page_shows_the_error_of_every_stage_and_what_stopping_earlier_would_have_cost(toy, tmp_path):
+def test_the_page_shows_the_error_of_every_stage_and_what_stopping_earlier_would_have_cost(
+    toy, tmp_path
+):
     inputs = {role: toy[stage] for role, stage in report.STAGE_OF.items() if stage in toy}
     assert run_stage("report", tmp_path / "report", inputs) == 0
     page = (tmp_path / "report/report.html").read_text()
@@ -185,8 +211,14 @@ def test_the_page_shows_the_error_of_every_stage_and_what_stopping_earlier_would
         for figure in figures_of(stage, facts):
             assert html.escape(figure, quote=True).replace("&#x27;", "&#39;") in page, stage
     told = page[page.index("What stopping earlier would have cost") :]
-    assert all(f"<td>{words}</td>" in told for words in ("before training", "half of the training", "lift", "refine"))
-    assert "not measured" not in page[page.index("error, and which way is better") : page.index("<b>total</b>")]
+    assert all(
+        f"<td>{words}</td>" in told
+        for words in ("before training", "half of the training", "lift", "refine")
+    )
+    assert (
+        "not measured"
+        not in page[page.index("error, and which way is better") : page.index("<b>total</b>")]
+    )
 
 
 def test_a_page_that_would_be_too_large_is_refused(toy, tmp_path, monkeypatch):
@@ -196,7 +228,9 @@ def test_a_page_that_would_be_too_large_is_refused(toy, tmp_path, monkeypatch):
     assert not (tmp_path / "report").exists()
 
 
-in_a_browser = pytest.mark.skipif(BROWSER is None, reason="neither chromium nor google-chrome is installed")
+in_a_browser = pytest.mark.skipif(
+    BROWSER is None, reason="neither chromium nor google-chrome is installed"
+)
 
 
 @pytest.mark.slow
@@ -210,7 +244,12 @@ def test_in_a_browser_the_page_fits_its_width_without_an_error_or_a_request(toy,
     assert len(seen["shown"]) > 1
     assert all(seen["shown"])
     # one picture a side, and what lies over it; nothing is left over from the mode before
-    assert seen["layers"] == {"photo | render": 2, "true labels | scene": 4, "2D teacher | scene": 4, "errors": 3}
+    assert seen["layers"] == {
+        "photo | render": 2,
+        "true labels | scene": 4,
+        "2D teacher | scene": 4,
+        "errors": 3,
+    }
 
 
 def reported(folder, names):
@@ -223,9 +262,14 @@ def reported(folder, names):
     figures |= {"names": names[:1], "left_out": dict(zip(names, reversed(names), strict=True))}
     figures["protocol"] |= {"name": names[2], "split": names[3]}
     stacks = {key: stack[:] for key, stack in held.pictures.items()}
-    stacks["labels"] = np.arange(stacks["labels"].size, dtype=np.int16).reshape(stacks["labels"].shape) % len(names)
+    stacks["labels"] = np.arange(stacks["labels"].size, dtype=np.int16).reshape(
+        stacks["labels"].shape
+    ) % len(names)
     inputs = {"evaluation": published(folder / "evaluation", Evaluation(figures, stacks))}
-    assert run_stage("report", folder / "report", inputs | {"gaussians": artifacts() / "train"}, {}) == 0
+    assert (
+        run_stage("report", folder / "report", inputs | {"gaussians": artifacts() / "train"}, {})
+        == 0
+    )
     return (folder / "report/report.html").read_text()
 
 
@@ -245,8 +289,14 @@ def test_names_are_text_of_the_report_and_never_markup(tmp_path):
 @pytest.mark.slow
 @in_a_browser
 def test_a_browser_would_notice_an_error_a_request_and_a_page_too_wide(tmp_path):
-    page = '<html><head></head><main><div style="overflow: auto"><p style="width: 500px">text</p></div>'
-    page += '<img src="http://a.invalid/x.png" style="width: 500px"><script>nothing()</script></main></html>'
+    page = (
+        '<html><head></head><main><div style="overflow: auto"><p style="width: '
+        '500px">text</p></div>'
+    )
+    page += (
+        '<img src="http://a.invalid/x.png" style="width: '
+        '500px"><script>nothing()</script></main></html>'
+    )
     seen, console, requests = browsed(tmp_path, page, 390)
     assert seen["problems"]
     assert console
@@ -260,8 +310,13 @@ def test_the_page_tells_how_far_views_agree_and_doubts_labels_where_they_do_not(
     inputs = {"evaluation": artifacts() / "evaluate", "gaussians": artifacts() / "train"}
     agreed = copied("agree", tmp_path)
     assert run_stage("report", tmp_path / "sure", inputs | {"agreement": agreed}, {}) == 0
-    assert "agreement of views on labels of 40 points" in (tmp_path / "sure/figures.csv").read_text()
+    assert (
+        "agreement of views on labels of 40 points" in (tmp_path / "sure/figures.csv").read_text()
+    )
     assert "in doubt" not in (tmp_path / "sure/report.html").read_text()
     changed("artifact.json", lambda said: said["facts"].update(doubt="views agree by 0.01"))(agreed)
     assert run_stage("report", tmp_path / "unsure", inputs | {"agreement": agreed}, {}) == 0
-    assert "Labels are in doubt:</b> views agree by 0.01." in (tmp_path / "unsure/report.html").read_text()
+    assert (
+        "Labels are in doubt:</b> views agree by 0.01."
+        in (tmp_path / "unsure/report.html").read_text()
+    )

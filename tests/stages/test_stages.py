@@ -48,15 +48,24 @@ def test_a_finished_artifact_is_whole_and_a_second_call_does_nothing(toy, stage,
 
 @pytest.mark.parametrize("stage", STAGES)
 def test_a_stage_says_what_it_computes_reads_and_writes(stage):
-    first, blank, *rest = inspect.getdoc(importlib.import_module(f"chebsplat.stages.{stage}").run).splitlines()
+    first, blank, *rest = inspect.getdoc(
+        importlib.import_module(f"chebsplat.stages.{stage}").run
+    ).splitlines()
     reads, writes = " ".join(rest).split("Writes ")
-    kinds = {name: row.schema.removeprefix("chebsplat.").partition("/")[0] for name, row in STAGES.items()}
+    kinds = {
+        name: row.schema.removeprefix("chebsplat.").partition("/")[0]
+        for name, row in STAGES.items()
+    }
     assert first.endswith(".") and not blank
     assert set(re.findall("`(.+?)`", reads)) == {kinds[of] for of in STAGES[stage].roles.values()}
     assert writes.startswith(f"`{kinds[stage]}`.")
 
 
-RECORDS = {"capture": (Capture, "ingest"), "points": (Points, "sfm"), "gaussians": (Gaussians, "train")}
+RECORDS = {
+    "capture": (Capture, "ingest"),
+    "points": (Points, "sfm"),
+    "gaussians": (Gaussians, "train"),
+}
 
 
 def but_for(role, change):
@@ -85,7 +94,9 @@ def one_frame(toy, tmp):
 
 def teacher_of_nothing(toy, tmp):
     model = color_teacher(tmp, weights=np.zeros((3, 3)))
-    return {}, {"channels": {"model": str(model), "reference": str(color_reference(tmp / "reference"))}}
+    return {}, {
+        "channels": {"model": str(model), "reference": str(color_reference(tmp / "reference"))}
+    }
 
 
 def photos_apart(toy, tmp):
@@ -128,7 +139,9 @@ def test_data_that_cannot_be_worked_with_is_exit_4(toy, stage, tmp_path):
 
 def test_a_scene_without_a_surface_is_known_by_views_alone_and_says_so(toy, tmp_path):
     points = Points.read(toy["sfm"])
-    few = {name: getattr(points, name)[:9] for name in ("means", "colors", "normals", "covariances")}
+    few = {
+        name: getattr(points, name)[:9] for name in ("means", "colors", "normals", "covariances")
+    }
     made = toy | {"sfm": published(tmp_path / "few", dataclasses.replace(points, **few))}
     for stage in (*OF_KNOWLEDGE, "refine"):
         made[stage] = tmp_path / stage
@@ -136,7 +149,8 @@ def test_a_scene_without_a_surface_is_known_by_views_alone_and_says_so(toy, tmp_
         facts = artifact.read_manifest(made[stage]).facts
         assert stage == "recall" or "9 points of a surface" in str(facts["left_out"]), stage
     assert facts["changed_by_knowledge"] == 0
-    assert artifact.read_manifest(made["recall"]).facts["of"] == []  # a lesson of nothing teaches nothing
+    # a lesson of nothing teaches nothing
+    assert artifact.read_manifest(made["recall"]).facts["of"] == []
 
 
 def test_rendering_only_scenes_leave_the_semantic_branch_out(toy, tmp_path):

@@ -16,10 +16,19 @@ REFINED = {
     "curve": CURVE,
     "knowledge": {"of": "depth"},
 }
-LESSON = {"given": False, "alike": 0.7, "familiar": 0.5, "n_points": 1234, "n_labels": 5, "unnamed": ["yoke"]}
+LESSON = {
+    "given": False,
+    "alike": 0.7,
+    "familiar": 0.5,
+    "n_points": 1234,
+    "n_labels": 5,
+    "unnamed": ["yoke"],
+}
 LESSON |= {"rho": 0.2, "sigma": 0.9, "novelty": 0.218, "known": 0.16}
 SOLVED = {
-    "of": [{"key": KEY, "scene": "attic", "trust": 1.0, "why": "its labels were given", "new": True}],
+    "of": [
+        {"key": KEY, "scene": "attic", "trust": 1.0, "why": "its labels were given", "new": True}
+    ],
 }
 
 
@@ -34,16 +43,21 @@ def page_of(folder, refined=REFINED, lesson=LESSON, lessons=SOLVED, knowledge=Tr
         if facts is not None:
             manifest = Manifest(f"chebsplat.{schema}", KEY, by, facts=facts, seconds=272.0)
             with publish(folder / role, manifest) as out:
-                write_document(out / "knowledge.json", {"teacher": "tiny", "card": card, "lessons": lessons})
+                write_document(
+                    out / "knowledge.json", {"teacher": "tiny", "card": card, "lessons": lessons}
+                )
             inputs[role] = folder / role
     assert run_stage("report", folder / "report", inputs, {}) == 0
     return " ".join((folder / "report/report.html").read_text().split())
 
 
-pytestmark = pytest.mark.filterwarnings("ignore:No artists with labels")  # the small trace has one row
+# the small trace has one row
+pytestmark = pytest.mark.filterwarnings("ignore:No artists with labels")
 
 
-def test_the_page_tells_which_lessons_a_scene_started_from_what_they_were_worth_and_what_it_adds(tmp_path):
+def test_the_page_tells_which_lessons_a_scene_started_from_what_they_were_worth_and_what_it_adds(
+    tmp_path,
+):
     page = page_of(tmp_path)
     for told in (
         "What this scene started from", "taught over 80 generated rooms", "1 of 1 are trusted", "attic",

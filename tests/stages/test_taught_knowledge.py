@@ -46,10 +46,17 @@ def planned(settings="", scene="office0"):
 def test_a_scene_starts_from_the_knowledge_that_ships_unless_it_is_told_not_to(quick_plans):
     shipped = artifact.read_manifest(SHIPPED).key
     steps, left_out = planned()
-    assert {steps[of].inputs[role].name for of, role in (("refine", "knowledge"), ("encode", "start"))} == {shipped}
+    assert {
+        steps[of].inputs[role].name for of, role in (("refine", "knowledge"), ("encode", "start"))
+    } == {shipped}
     assert set(OF_KNOWLEDGE) - steps.keys() == {"recall"} and "no lesson" in left_out["recall"]
-    assert set(OF_KNOWLEDGE) <= planned("teacher.kind=labels")[0].keys() | {"recall"}  # by the names of its classes
-    for start, lost in (("none", set(OF_KNOWLEDGE)), ("shipped", {"learn", "recall"}), (SHIPPED, {"learn", "recall"})):
+    # by the names of its classes
+    assert set(OF_KNOWLEDGE) <= planned("teacher.kind=labels")[0].keys() | {"recall"}
+    for start, lost in (
+        ("none", set(OF_KNOWLEDGE)),
+        ("shipped", {"learn", "recall"}),
+        (SHIPPED, {"learn", "recall"}),
+    ):
         steps, left_out = planned(f"knowledge.start={start}")
         assert set(OF_KNOWLEDGE) - steps.keys() == lost
         assert all(left_out[stage] for stage in lost)
@@ -73,7 +80,10 @@ def test_another_teacher_has_none_until_it_is_taught(quick_plans, tmp_path):
     assert all("chebsplat knowledge teach" in left_out[stage] for stage in OF_KNOWLEDGE)
     plan = teaching(Planner(), model, "teach.n_rooms=2,teach.seed=3")
     assert [step.stage for step in plan.steps] == ["channels", "teach"]
-    assert plan.steps[1].sections["teach"].items() >= {"n_rooms": 2, "seed": 3, "model": str(model)}.items()
+    assert (
+        plan.steps[1].sections["teach"].items()
+        >= {"n_rooms": 2, "seed": 3, "model": str(model)}.items()
+    )
     other = teaching(Planner(), None, f"teach.model={model}").steps[1].sections
     assert other["teach"]["model"] == str(model)
     closed = color_teacher(tmp_path, name="closed", output="logits")
@@ -115,7 +125,8 @@ def test_what_ships_is_whole_small_and_says_what_it_was_taught():
     assert knowledge.card["n_rooms"] >= 64
     assert knowledge.card["held_out"]["shape"] > 0.8
     assert set(CLASS_NAMES) <= set(knowledge.words)
-    np.testing.assert_allclose(taught(knowledge, {}).map, knowledge.map, atol=1e-4)  # no lesson adds nothing
+    # no lesson adds nothing
+    np.testing.assert_allclose(taught(knowledge, {}).map, knowledge.map, atol=1e-4)
 
 
 @pytest.mark.xdist_group("toy")
@@ -123,9 +134,11 @@ def test_scenes_of_codes_meet_knowledge_through_words(toy):
     knowledge, features = read_knowledge(toy["teach"]), Features.read(toy["teacher"])
     words = [knowledge.words.index(name) for name in features.label_names]
     embeddings = units(knowledge.embeddings[words])
-    answers = np.concatenate([0 * embeddings, 3 * embeddings], 1)  # in channels, which do not count, and in words
+    # in channels, which do not count, and in words
+    answers = np.concatenate([0 * embeddings, 3 * embeddings], 1)
     others = features.label_names[1:]
-    for lost, name in enumerate((f"{features.label_names[0]}_2", "thingamajig")):  # without a word: without a vote
+    # without a word: without a vote
+    for lost, name in enumerate((f"{features.label_names[0]}_2", "thingamajig")):
         features.label_names = [name, *others]
         made = into_channels(toy["teach"], knowledge, features)(answers)
         assert made.shape == features.label_embeddings.shape
@@ -144,14 +157,21 @@ def test_the_exported_encoder_says_what_torch_says(toy):
     for count in (400, 1):
         some = first(inputs, count)
         given = some._asdict() | {"neighbors": some.neighbors.astype(np.int64)}
-        np.testing.assert_allclose(runner.run(None, given)[0], answered(knowledge, some), rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(
+            runner.run(None, given)[0], answered(knowledge, some), rtol=1e-5, atol=1e-4
+        )
     assert artifact.read_manifest(toy["onnx"]).facts["largest_difference"] <= 1e-4
 
 
 def refined(toy, out, config=None, **changes):
     """Facts of a refine stage of the toy with some inputs changed or, where None, left away."""
     inputs = {role: toy[of] for role, of in INPUTS["refine"].items()} | changes
-    assert run_stage("refine", out, {role: path for role, path in inputs.items() if path is not None}, config) == 0
+    assert (
+        run_stage(
+            "refine", out, {role: path for role, path in inputs.items() if path is not None}, config
+        )
+        == 0
+    )
     return artifact.read_manifest(out).facts
 
 
@@ -159,7 +179,8 @@ def refined(toy, out, config=None, **changes):
 def test_labels_without_a_word_are_named_and_the_rest_of_knowledge_counts(toy, tmp_path):
     assert "knowledge" not in refined(toy, tmp_path / "a", knowledge=None)
     features = Features.read(toy["teacher"])
-    for names, what in (([*features.label_names[:-1], "thingamajig"], "votes of shape on some labels"),
+    for names, what in (([*features.label_names[:-1], "thingamajig"], "votes of shape on some "
+                                                                      "labels"),
                         ([f"thing{'amajig' * k}" for k in range(1, 1 + len(features.label_names))],
                          "knowledge of shape")):  # fmt: skip
         features.label_names = names
@@ -187,36 +208,55 @@ def test_a_swept_room_is_what_its_photos_tell_of_depth(network, monkeypatch):
     settings = TeachSection(n_views=16, n_points=3000)
     whole, _, _, swept = teaching_rooms.rooms_of(KNOWLEDGE[1], settings, network, np.eye(3))
     assert len(swept.n_views) > 1000
-    middle = whole.inputs.means.max(0)  # both are about their own centroids: of floor and walls the corner is common
-    away, _ = cKDTree(whole.inputs.means).query(swept.inputs.means + (middle - swept.inputs.means.max(0)))
+    # both are about their own centroids: of floor and walls the corner is common
+    middle = whole.inputs.means.max(0)
+    away, _ = cKDTree(whole.inputs.means).query(
+        swept.inputs.means + (middle - swept.inputs.means.max(0))
+    )
     assert np.median(away) < 0.15  # spacing of the compared points, and of the corner, included
     assert (swept.n_views > 1).mean() > 0.6
-    monkeypatch.setattr(teaching_rooms, "swept", lambda *_: Surface(np.zeros((0, 3)), np.zeros((0, 3))))
-    again = teaching_rooms.rooms_of(KNOWLEDGE[1], TeachSection(n_views=2, n_points=200), network, np.eye(3))
+    monkeypatch.setattr(
+        teaching_rooms, "swept", lambda *_: Surface(np.zeros((0, 3)), np.zeros((0, 3)))
+    )
+    again = teaching_rooms.rooms_of(
+        KNOWLEDGE[1], TeachSection(n_views=2, n_points=200), network, np.eye(3)
+    )
     assert again[3] is again[0]
 
 
 @pytest.mark.xdist_group("toy")
-def test_without_measured_depth_knowledge_is_asked_of_swept_depth_or_left_out(toy, tmp_path, monkeypatch):
+def test_without_measured_depth_knowledge_is_asked_of_swept_depth_or_left_out(
+    toy, tmp_path, monkeypatch
+):
     withheld = TOY | {"ingest": {"depth": "off"}}
     assert run_stage("ingest", tmp_path / "ingest", {}, withheld) == 0
     facts = {}
-    for name, dense, least in (("enough", "on", 0.1), ("too little", "on", 0.9), ("none", "off", 0.1)):
+    for name, dense, least in (
+        ("enough", "on", 0.1),
+        ("too little", "on", 0.9),
+        ("none", "off", 0.1),
+    ):
         monkeypatch.setattr(surfaces, "LEAST_TOLD", least)  # the toy's photos tell a fifth
-        config, made = withheld | {"sfm": {"max_points": 300, "dense": dense}}, toy | {"ingest": tmp_path / "ingest"}
+        config, made = (
+            withheld | {"sfm": {"max_points": 300, "dense": dense}},
+            toy | {"ingest": tmp_path / "ingest"},
+        )
         for stage in ("sfm", "describe", "encode", "learn", "refine"):
             made[stage] = tmp_path / name / stage
             inputs = {role: made[of] for role, of in INPUTS[stage].items()}
             assert run_stage(stage, made[stage], inputs, config) == 0
             facts[name, stage] = artifact.read_manifest(made[stage]).facts
     assert facts["enough", "refine"]["start"] == "trained"
-    assert facts["enough", "refine"]["unit_from"] == "source"  # generated: metric without depth, too
+    # generated: metric without depth, too
+    assert facts["enough", "refine"]["unit_from"] == "source"
     assert facts["enough", "refine"]["knowledge"]["of"] == "swept depth"
     assert facts["enough", "learn"]["n_points"] > 0
     for name, why in (("too little", "too little"), ("none", "were not swept")):
         for stage in ("describe", "encode", "refine"):
             assert why in facts[name, stage]["left_out"]["knowledge of shape"]
         assert why in facts[name, "learn"]["left_out"]["a lesson"]
-        assert facts[name, "refine"]["strength"] == facts[name, "refine"]["changed_by_knowledge"] == 0
+        assert (
+            facts[name, "refine"]["strength"] == facts[name, "refine"]["changed_by_knowledge"] == 0
+        )
     assert artifact.read_manifest(toy["refine"]).facts["start"] == "both"
     assert artifact.read_manifest(toy["refine"]).facts["knowledge"]["of"] == "depth"

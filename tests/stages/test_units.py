@@ -1,4 +1,6 @@
-"""A source in any unit, about any origin, is the same scene, and what is exported has the source's own."""
+"""A source in any unit, about any origin, is the same scene, and what is exported has the source's
+own.
+"""
 
 import shutil
 
@@ -21,7 +23,13 @@ from chebsplat.stages.tools.page import foreign
 from chebsplat.stages.tools.scene import OpenedScene
 from chebsplat.stages.training.assembly import started
 
-CHANGES = {"as it is": (1.0, 0.0), "tiny": (1e-4, 0.0), "huge": (1e4, 0.0), "far": (1.0, 1e6), "both": (1e-3, -7e4)}
+CHANGES = {
+    "as it is": (1.0, 0.0),
+    "tiny": (1e-4, 0.0),
+    "huge": (1e4, 0.0),
+    "far": (1.0, 1e6),
+    "both": (1e-3, -7e4),
+}
 
 
 def written(folder, scale, offset):
@@ -29,9 +37,15 @@ def written(folder, scale, offset):
     fields = generated.capture("toy", 1, "toy")
     pixels = np.argwhere(np.ones((72, 96), bool))[::31]
     seen = range(0, 16, 3)
-    parts = [unproject(fields["depth"][k], fields["Ks"][k], fields["cam_from_world"][k], pixels) for k in seen]
+    parts = [
+        unproject(fields["depth"][k], fields["Ks"][k], fields["cam_from_world"][k], pixels)
+        for k in seen
+    ]
     colors = np.concatenate([fields["images"][k][pixels[:, 0], pixels[:, 1]] for k in seen])
-    points, origin = scale * np.concatenate(parts) + [offset, offset, 0], np.array([offset, offset, 0])
+    points, origin = (
+        scale * np.concatenate(parts) + [offset, offset, 0],
+        np.array([offset, offset, 0]),
+    )
     fields["cam_from_world"][:, :3, 3] *= scale
     fields["cam_from_world"][:, :3, 3] -= fields["cam_from_world"][:, :3, :3] @ origin
     layouts.write_colmap(folder, fields)
@@ -55,7 +69,8 @@ def scenes(tmp_path_factory):
             "source": {"kind": "colmap", "path": str(place / "source")},
             "sfm": {"dense": "off"},
             "train": {"semantics": False, "steps": 60, "report_every": 30, "max_gaussians": 3000}
-            | {"densify": "off", "prune": False, "sh_prune": False},  # what chance decides differs by .8 dB
+            # what chance decides differs by .8 dB
+            | {"densify": "off", "prune": False, "sh_prune": False},
             "evaluate": {"timing_repeats": 0},
         }
         made = {}
@@ -86,29 +101,46 @@ def test_units_and_origin_change_neither_the_picture_nor_what_is_exported(scenes
     assert np.abs(moved - origin - scale * ends).max() < 0.02 * scale * (ends[1] - ends[0]).max()
     sizes = [np.median(read_ply(ply)[0]["log_scales"]) for ply in files]
     assert sizes[1] - sizes[0] == pytest.approx(np.log(scale), abs=0.05)
-    begun = started(files[1], points, TrainSection(), Capture.read(opened.source.parent / "ingest"))["means"].numpy()
+    begun = started(
+        files[1], points, TrainSection(), Capture.read(opened.source.parent / "ingest")
+    )["means"].numpy()
     assert np.allclose(begun, opened.parameters["means"], atol=1e-5)
     for camera, pose in zip(opened.cameras, poses, strict=True):
         assert np.allclose(camera.cam_from_world[:3, :3], pose[:3, :3])
-        assert np.abs(camera.position + pose[:3, :3].T @ pose[:3, 3]).max() < 1e-6 * scale + rounding
+        assert (
+            np.abs(camera.position + pose[:3, :3].T @ pose[:3, 3]).max() < 1e-6 * scale + rounding
+        )
     pictures = [scene.render(scene.cameras[0]) for scene in (plain, opened)]
-    assert np.nanmedian(pictures[1].depth) == pytest.approx(scale * np.nanmedian(pictures[0].depth), rel=0.02)
+    assert np.nanmedian(pictures[1].depth) == pytest.approx(
+        scale * np.nanmedian(pictures[0].depth), rel=0.02
+    )
     assert np.abs(pictures[1].color.astype(float) - pictures[0].color).mean() < 3
     box = np.array([ends[0], ends.mean(0)])
     parts = plain.select(box=box.ravel()), opened.select(box=(origin + scale * box).ravel())
     assert len(parts[1]) == pytest.approx(len(parts[0]), rel=0.1)
-    assert np.allclose(places(parts[1].to_ply(tmp_path / "part.ply")), parts[1].points()[0], rtol=1e-6, atol=0)
+    assert np.allclose(
+        places(parts[1].to_ply(tmp_path / "part.ply")), parts[1].points()[0], rtol=1e-6, atol=0
+    )
 
 
 @pytest.mark.parametrize("color", [0.0, 0.4, 1.0])
-def test_a_given_splat_of_one_colour_begins_with_the_points_colours_and_another_with_its_own(scenes, color, tmp_path):
+def test_a_given_splat_of_one_colour_begins_with_the_points_colours_and_another_with_its_own(
+    scenes, color, tmp_path
+):
     _, opened, _, points = scenes["tiny"]
     given = opened.parameters
-    own = started(opened.source / "scene.ply", points, TrainSection(), Capture.read(opened.source.parent / "ingest"))
+    own = started(
+        opened.source / "scene.ply",
+        points,
+        TrainSection(),
+        Capture.read(opened.source.parent / "ingest"),
+    )
     assert np.allclose(own["sh0"], given["sh0"])
     sh0 = np.full_like(given["sh0"], (color - 0.5) / 0.28209479177387814)
     write_ply(tmp_path / "one.ply", given | {"sh0": sh0}, 0, world=opened.world)
-    found = started(tmp_path / "one.ply", points, TrainSection(), Capture.read(opened.source.parent / "ingest"))
+    found = started(
+        tmp_path / "one.ply", points, TrainSection(), Capture.read(opened.source.parent / "ingest")
+    )
     nearest = np.linalg.norm(given["means"][:, None] - points.means, axis=-1).argmin(1)
     shown = 255 * (found["sh0"][:, 0].numpy() * 0.28209479177387814 + 0.5)
     assert np.abs(shown - points.colors[nearest]).max() < 0.01
@@ -128,4 +160,6 @@ def test_a_splat_from_elsewhere_is_seen_in_any_unit_and_keeps_its_own(scenes, na
         pictures.append(scene.render(scene.cameras[0]))
     assert np.allclose(middles[1], [offset, offset, 0] + scale * middles[0], rtol=1e-6)
     assert np.abs(pictures[1].color.astype(float) - pictures[0].color).mean() < 1
-    assert np.nanmedian(pictures[1].depth) == pytest.approx(scale * np.nanmedian(pictures[0].depth), rel=1e-3)
+    assert np.nanmedian(pictures[1].depth) == pytest.approx(
+        scale * np.nanmedian(pictures[0].depth), rel=1e-3
+    )

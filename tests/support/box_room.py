@@ -1,4 +1,6 @@
-"""A generated scene for pages: the inside of a box with a sofa and a chair, and a teacher of ten words."""
+"""A generated scene for pages: the inside of a box with a sofa and a chair, and a teacher of ten
+words.
+"""
 
 import numpy as np
 from shared import KEY
@@ -31,19 +33,29 @@ def words():
 
 
 def room(n=N, seed=0):
-    """n Gaussians on the inside of a box of 5 x 4 x 2.5 and on two blocks in it; colour varies along surfaces."""
+    """n Gaussians on the inside of a box of 5 x 4 x 2.5 and on two blocks in it; colour varies
+    along surfaces.
+    """
     rng = np.random.default_rng(seed)
-    boxes = [((-2.5, -2, 0), (2.5, 2, 2.5)), ((-1.5, 0.8, 0), (0.2, 1.7, 0.9)), ((0.8, 0.2, 0), (1.5, 0.9, 1.1))]
+    boxes = [
+        ((-2.5, -2, 0), (2.5, 2, 2.5)),
+        ((-1.5, 0.8, 0), (0.2, 1.7, 0.9)),
+        ((0.8, 0.2, 0), (1.5, 0.9, 1.1)),
+    ]
     shares = rng.choice(3, n, p=[0.7, 0.18, 0.12])
     low, high = (np.array([box[side] for box in boxes])[shares] for side in (0, 1))
     means = low + rng.random((n, 3)) * (high - low)
     axis, side = rng.choice(3, n, p=[0.3, 0.3, 0.4]), rng.integers(0, 2, n)
     means[np.arange(n), axis] = np.where(side[:, None], high, low)[np.arange(n), axis]
-    labels = np.where(shares > 0, shares + 2, np.where(axis < 2, 0, np.where(side, 2, 1))).astype(np.int32)
+    labels = np.where(shares > 0, shares + 2, np.where(axis < 2, 0, np.where(side, 2, 1))).astype(
+        np.int32
+    )
     log_scales = np.full((n, 3), np.log(0.05)) + rng.normal(0, 0.3, (n, 3))
     log_scales[np.arange(n), axis] = np.log(0.004)
     phase = means @ rng.normal(0, 2, (3, 3)) + labels[:, None] * np.array([1.0, 2.1, 3.3])
-    quats = np.concatenate([np.ones((n, 1)), rng.normal(0, 0.05, (n, 3))], 1) * rng.uniform(0.5, 2, (n, 1))
+    quats = np.concatenate([np.ones((n, 1)), rng.normal(0, 0.05, (n, 3))], 1) * rng.uniform(
+        0.5, 2, (n, 1)
+    )
     features = words()[labels] * rng.uniform(0.8, 1.2, (n, 1)) + rng.normal(0, 0.1, (n, 8))
     parameters = {
         "means": means, "log_scales": log_scales, "quats": quats, "logit_opacities": rng.normal(1.5, 1.0, n),
@@ -69,7 +81,8 @@ def looking(eye, target):
 def made(folder, calibrated=False):
     """A folder of links of a scene with a teacher that knows ten words; as read from it.
 
-    calibrated: whether the teacher's relevancy is: RIVALS are the words that others are weighed against.
+    calibrated: whether the teacher's relevancy is: RIVALS are the words that others are weighed
+      against.
     """
     model = folder.parent / "toy.onnx"
     model.write_bytes(b"not run by a page")
@@ -87,9 +100,13 @@ def made(folder, calibrated=False):
     with artifact.publish(folder / "export", Manifest("chebsplat.scene/3", KEY, "export")) as tmp:
         held.write(tmp)
     convention = {"kind": "onnx", "output": "features", "sha256": sha256_file(model)}
-    features = Features(views, np.zeros((3, 2, 2, 8), np.float16), LABELS, words()[:5], convention=convention)
+    features = Features(
+        views, np.zeros((3, 2, 2, 8), np.float16), LABELS, words()[:5], convention=convention
+    )
     facts = {"config": {"teacher": {"model": str(model)}}}
-    with artifact.publish(folder / "teacher", Manifest("chebsplat.features/2", KEY, "teacher", **facts)) as tmp:
+    with artifact.publish(
+        folder / "teacher", Manifest("chebsplat.features/2", KEY, "teacher", **facts)
+    ) as tmp:
         features.write(tmp)
     return folder, Scene.read(folder / "export")
 

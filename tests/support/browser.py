@@ -1,5 +1,5 @@
-"""What a real browser makes of a page: errors, requests, width, what is cut off or scrolls sideways, and what its
-slider shows in every mode.
+"""What a real browser makes of a page: errors, requests, width, what is cut off or scrolls
+sideways, and what its slider shows in every mode.
 """
 
 import json
@@ -31,14 +31,30 @@ addEventListener("message", event => document.querySelector("pre").textContent =
 
 
 def browsed(folder, text, wide):
-    """What a browser makes of a page in a frame `wide` pixels across: (its report, console lines, its requests)."""
+    """What a browser makes of a page in a frame `wide` pixels across: (its report, console lines,
+    its requests).
+    """
     (folder / "page.html").write_text(text.replace("<head>", "<head>" + WATCH))
     (folder / "frame.html").write_text(FRAME.replace("WIDE", str(wide)))
-    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom"]
-    command += [f"--user-data-dir={folder}/profile", f"--log-net-log={folder}/net.json", "--window-size=1500,1000"]
+    command = [
+        BROWSER,
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--enable-logging=stderr",
+        "--dump-dom",
+    ]
+    command += [
+        f"--user-data-dir={folder}/profile",
+        f"--log-net-log={folder}/net.json",
+        "--window-size=1500,1000",
+    ]
     command += ["--virtual-time-budget=5000", "--host-resolver-rules=MAP * ~NOTFOUND"]
-    done = subprocess.run([*command, (folder / "frame.html").as_uri()], capture_output=True, text=True, timeout=120)
+    done = subprocess.run(
+        [*command, (folder / "frame.html").as_uri()], capture_output=True, text=True, timeout=120
+    )
     seen = json.loads(done.stdout.split("<pre>")[1].split("</pre>")[0])
     console = [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-    log = (folder / "net.json").read_text().splitlines()  # the browser's own requests have another site
+    # the browser's own requests have another site
+    log = (folder / "net.json").read_text().splitlines()
     return seen, console, [line for line in log if "site=file://" in line and '"url":"http' in line]

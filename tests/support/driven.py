@@ -1,4 +1,6 @@
-"""A real browser driven over its pipe: pages from a file, scripts, mouse and keys, pictures, what it complains of."""
+"""A real browser driven over its pipe: pages from a file, scripts, mouse and keys, pictures, what
+it complains of.
+"""
 
 import base64
 import json
@@ -18,7 +20,9 @@ FLAGS = ("--headless=new", "--no-sandbox", "--no-first-run", "--hide-scrollbars"
 
 
 class Driven:
-    """One page of the browser. `complaints`: console errors and exceptions; `requested`: URLs asked for."""
+    """One page of the browser. `complaints`: console errors and exceptions; `requested`: URLs asked
+    for.
+    """
 
     def __init__(self, send, receive, group):
         self.group = group
@@ -54,7 +58,11 @@ class Driven:
         method, given = answer.get("method"), answer.get("params", {})
         if method == "Runtime.exceptionThrown":
             self.complaints.append(json.dumps(given["exceptionDetails"])[:500])
-        elif method == "Runtime.consoleAPICalled" and given["type"] in ("error", "warning", "assert"):
+        elif method == "Runtime.consoleAPICalled" and given["type"] in (
+            "error",
+            "warning",
+            "assert",
+        ):
             self.complaints.append(json.dumps(given["args"])[:500])
         elif method == "Log.entryAdded" and given["entry"]["level"] in ("error", "warning"):
             self.complaints.append(given["entry"]["text"])
@@ -67,7 +75,9 @@ class Driven:
     def open(self, page, width, height, dark=False):
         """A file's path, or a URL of this machine."""
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)[
+            "sessionId"
+        ]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
         self.size(width, height)
@@ -80,11 +90,19 @@ class Driven:
             self._next(until)
 
     def size(self, width, height):
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=False,
+        )
 
     def run(self, script):
         """What an expression gives, awaited."""
-        done = self.call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)
+        done = self.call(
+            "Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True
+        )
         if "exceptionDetails" in done:
             raise RuntimeError(json.dumps(done["exceptionDetails"])[:1000])
         return done["result"].get("value")
@@ -94,7 +112,9 @@ class Driven:
 
     def click(self, x, y):
         for kind in ("Moved", "Pressed", "Released"):
-            self.mouse(kind, x, y, **({} if kind == "Moved" else {"button": "left", "clickCount": 1}))
+            self.mouse(
+                kind, x, y, **({} if kind == "Moved" else {"button": "left", "clickCount": 1})
+            )
 
     def drag(self, start, end, steps=8):
         self.mouse("Moved", *start)

@@ -1,4 +1,6 @@
-"""Names that HTML, Markdown, a template or matplotlib would take for their own, and what a page makes of them."""
+"""Names that HTML, Markdown, a template or matplotlib would take for their own, and what a page
+makes of them.
+"""
 
 import re
 from html.parser import HTMLParser
@@ -6,13 +8,18 @@ from html.parser import HTMLParser
 NAMES = [
     "<svg><script>alert(1)</script>", "<img src=x onerror=alert(1)>", "\"><b onmouseover='alert(1)'>",
     "</script><script>alert(1)</script>", "</style></textarea>--><script>alert(1)</script>", "a_b_c *x*", "`rm -rf`",
-    "{{ 7 * 7 }}{% if %}", "$x$ and $\\frac", "[a](javascript:alert(1))", "| a | b |", "# a", "&lt;b&gt; &amp;",
+    "{{ 7 * 7 }}{% if %}", "$x$ and $\\frac", "[a](javascript:alert(1))", "| a | b |", "# a", "&lt;b&gt; "
+                                                                                              ""
+                                                                                              ""
+                                                                                              "&amp;",
     "_x", "x" * 200,
 ]  # fmt: skip
 
 
 class Shape(HTMLParser):
-    """tags: those of a page in order, with their attributes' names; text: what it shows, a space between words."""
+    """tags: those of a page in order, with their attributes' names; text: what it shows, a space
+    between words.
+    """
 
     def __init__(self, page):
         super().__init__()

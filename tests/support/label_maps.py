@@ -1,5 +1,5 @@
-"""Label maps as people have them: writers of a view's map, by its path without an ending and its classes [H, W]. Of
-every table the last row is for -1, no class.
+"""Label maps as people have them: writers of a view's map, by its path without an ending and its
+classes [H, W]. Of every table the last row is for -1, no class.
 """
 
 import numpy as np
@@ -27,12 +27,16 @@ def arrays(table, kind=np.int64, axes=None):
 
 
 def masks(names, form="png", swapped=False):
-    """One mask for each class that a view shows: VIEW/CLASS, or CLASS/VIEW; of JPEG a pixel fills a block."""
+    """One mask for each class that a view shows: VIEW/CLASS, or CLASS/VIEW; of JPEG a pixel fills a
+    block.
+    """
     block = np.ones((16, 16), bool) if form == "jpg" else np.ones((1, 1), bool)
 
     def write(path, classes):
         for k in set(classes[classes >= 0].tolist()):
             place = path.parent / names[k] / path.name if swapped else path / names[k]
-            pictures([0, 255], ending=f".{form}", form=None)(place, np.kron(classes == k, block).astype(int))
+            pictures([0, 255], ending=f".{form}", form=None)(
+                place, np.kron(classes == k, block).astype(int)
+            )
 
     return write

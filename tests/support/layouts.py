@@ -1,4 +1,6 @@
-"""Writers that lay a capture out on disk as data sets do: PNG where the format allows it, so that nothing is lost."""
+"""Writers that lay a capture out on disk as data sets do: PNG where the format allows it, so that
+nothing is lost.
+"""
 
 import json
 
@@ -39,7 +41,14 @@ def write_nice_slam(folder, fields, suffix="png"):
     rows = (" ".join(repr(float(v)) for v in pose.ravel()) for pose in world_from_cam(fields))
     write_text(folder / "traj.txt", "\n".join(rows) + "\n")
     K, (height, width) = fields["Ks"][0], fields["images"].shape[1:3]
-    camera = {"w": width, "h": height, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2] - 0.5, "cy": K[1, 2] - 0.5}
+    camera = {
+        "w": width,
+        "h": height,
+        "fx": K[0, 0],
+        "fy": K[1, 1],
+        "cx": K[0, 2] - 0.5,
+        "cy": K[1, 2] - 0.5,
+    }
     write_text(folder / "cam_params.json", json.dumps({"camera": camera | {"scale": 6553.5}}))
 
 
@@ -54,7 +63,10 @@ def write_semantic_nerf(folder, fields):
     rows = (" ".join(repr(float(v)) for v in pose.ravel()) for pose in world_from_cam(fields))
     write_text(sequence / "traj_w_c.txt", "\n".join(rows) + "\n")
     classes = [{"id": k, "name": name} for k, name in zip(ids, fields["class_names"], strict=True)]
-    write_text(folder / "info_semantic.json", json.dumps({"classes": [{"id": 0, "name": "undefined"}, *classes]}))
+    write_text(
+        folder / "info_semantic.json",
+        json.dumps({"classes": [{"id": 0, "name": "undefined"}, *classes]}),
+    )
 
 
 def write_colmap(folder, fields):
@@ -64,15 +76,25 @@ def write_colmap(folder, fields):
     values = " ".join(repr(float(v)) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     write_text(folder / "sparse/0/cameras.txt", f"1 PINHOLE {width} {height} {values}\n")
     rows = []
-    for k, (name, pose) in enumerate(zip(fields["names"], fields["cam_from_world"], strict=True), 1):
+    for k, (name, pose) in enumerate(
+        zip(fields["names"], fields["cam_from_world"], strict=True), 1
+    ):
         quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
-        rows.append(f"{k} {' '.join(repr(float(v)) for v in (*quaternion, *pose[:3, 3]))} 1 {name}.png\n\n")
+        rows.append(
+            f"{k} {' '.join(repr(float(v)) for v in (*quaternion, *pose[:3, 3]))} 1 {name}.png\n\n"
+        )
         save(folder / f"images/{name}.png", fields["images"][k - 1])
         save(folder / f"depth/{name}.png", stored_depth(fields["depth"][k - 1]))
-        save(folder / f"semantic/{name}.png", raw_labels(fields["labels"][k - 1], ids).astype(np.uint8))
+        save(
+            folder / f"semantic/{name}.png",
+            raw_labels(fields["labels"][k - 1], ids).astype(np.uint8),
+        )
     write_text(folder / "sparse/0/images.txt", "".join(rows))
     write_text(folder / "sparse/0/points3D.txt", "")
-    write_text(folder / "labels.json", json.dumps(dict(zip(map(str, ids), fields["class_names"], strict=True))))
+    write_text(
+        folder / "labels.json",
+        json.dumps(dict(zip(map(str, ids), fields["class_names"], strict=True))),
+    )
 
 
 def write_seven_scenes(folder, fields, suffix="png", unknown=65_535):
@@ -84,7 +106,8 @@ def write_seven_scenes(folder, fields, suffix="png", unknown=65_535):
     write_text(folder / "camera-intrinsics.txt", matrix_text(fields["Ks"][0]))
 
 
-# ScanNet's raw ids of the 20 shared classes, the same in both of its tables; 22 is books, which both call other props.
+# ScanNet's raw ids of the 20 shared classes, the same in both of its tables; 22 is books, which
+# both call other props.
 SCANNET_IDS = {"wall": 1, "floor": 3, "cabinet": 7, "bed": 11, "chair": 2, "sofa": 6, "table": 4, "door": 5,
                "window": 16, "shelves": 8, "counter": 35, "curtain": 21, "ceiling": 41, "refrigerator": 27,
                "television": 33, "person": 80, "toilet": 17, "sink": 14, "lamp": 28, "bag": 47,
@@ -128,7 +151,8 @@ def write_scannet_sg(folder, fields, suffix="png"):
 
 
 def write_scannet_pl(folder, fields, folded=True, objects=None):
-    """`folded`: labels as the authors give them away, reduced; otherwise ScanNet's own and its objects' ids.
+    """`folded`: labels as the authors give them away, reduced; otherwise ScanNet's own and its
+    objects' ids.
 
     Pseudo labels of half the size where the fields have them, with the confidence of each pixel.
     """
@@ -140,11 +164,15 @@ def write_scannet_pl(folder, fields, folded=True, objects=None):
         place.parent.mkdir(exist_ok=True)
         confidence = fields["confidence"][k, ::2, ::2].astype(np.float32)
         shares = np.zeros((*confidence.shape, 22), np.float32)
-        np.savez_compressed(place, probability=shares, confidence=confidence, confidence_notta=confidence)
+        np.savez_compressed(
+            place, probability=shares, confidence=confidence, confidence_notta=confidence
+        )
     for k, labels in enumerate(fields["labels"]):
         save(folder / f"depth/{10 * k}.png", stored_depth(fields["depth"][k]))
         if folded:
-            save(folder / f"rs_semantics/{10 * k}.png", raw_labels(labels, reduced).astype(np.uint8))
+            save(
+                folder / f"rs_semantics/{10 * k}.png", raw_labels(labels, reduced).astype(np.uint8)
+            )
         else:
             save(folder / f"semantics/{10 * k}.png", raw_labels(labels, own))
             save(folder / f"instance/{10 * k}.png", objects[k].astype(np.uint8))
@@ -153,4 +181,5 @@ def write_scannet_pl(folder, fields, folded=True, objects=None):
     names = [str(10 * k) for k in range(len(fields["images"]))]
     split = {"train": [name for k, name in enumerate(names) if k % 5], "test": names[::5]}
     write_text(folder / "splits.json", json.dumps(split))
-    (folder / "segmentation_data.pkl").write_bytes(b"cos\nsystem\n(S'exit 1'\ntR.")  # must never be unpickled
+    # must never be unpickled
+    (folder / "segmentation_data.pkl").write_bytes(b"cos\nsystem\n(S'exit 1'\ntR.")

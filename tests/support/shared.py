@@ -91,8 +91,17 @@ def gaussian_parameters(n=6, seed=0):
     shN = rng.normal(size=(n, 15, 3)).astype(np.float32)
     for row, degree in enumerate(degrees):
         shN[row, REST[int(degree)] :] = 0
-    shapes = {"means": (n, 3), "log_scales": (n, 3), "quats": (n, 4), "logit_opacities": (n,), "sh0": (n, 1, 3)}
-    return {k: rng.normal(size=s).astype(np.float32) for k, s in shapes.items()} | {"shN": shN, "degrees": degrees}
+    shapes = {
+        "means": (n, 3),
+        "log_scales": (n, 3),
+        "quats": (n, 4),
+        "logit_opacities": (n,),
+        "sh0": (n, 1, 3),
+    }
+    return {k: rng.normal(size=s).astype(np.float32) for k, s in shapes.items()} | {
+        "shN": shN,
+        "degrees": degrees,
+    }
 
 
 def published(path, record, **facts):
@@ -137,7 +146,9 @@ def finish(plan):
 
     for step in plan.steps:
         inputs = {role: {"key": path.name, "schema": "s/1"} for role, path in step.inputs.items()}
-        with artifact.publish(step.path, Manifest(STAGES[step.stage].schema, step.key, step.stage, inputs)):
+        with artifact.publish(
+            step.path, Manifest(STAGES[step.stage].schema, step.key, step.stage, inputs)
+        ):
             pass
 
 

@@ -12,7 +12,10 @@ def region(n=24, seed=0, m=3):
     """Flat clouds of random Gaussians: means, scales, rotmats, mask."""
     g = torch.Generator().manual_seed(seed)
     means = torch.randn(m, n, 3, generator=g, dtype=torch.float64) * torch.tensor([1.0, 0.7, 0.2])
-    scales = torch.rand(m, n, 3, generator=g, dtype=torch.float64) * torch.tensor([0.3, 0.2, 0.02]) + 0.01
+    scales = (
+        torch.rand(m, n, 3, generator=g, dtype=torch.float64) * torch.tensor([0.3, 0.2, 0.02])
+        + 0.01
+    )
     rotmats = rotation_matrices(torch.randn(m, n, 4, generator=g, dtype=torch.float64))
     return means, scales, rotmats, torch.ones(m, n, dtype=torch.bool)
 

@@ -1,8 +1,10 @@
-"""A GPU that is none: tensors of the CPU, each marked with where it would lie, and a record of what moves.
+"""A GPU that is none: tensors of the CPU, each marked with where it would lie, and a record of what
+moves.
 
-FakeTensorMode, which is meant for this, ends the process where a fake CUDA tensor requires a gradient and torch is
-built without CUDA. Here values are real, so a whole training runs, backward and optimizer too, and the rule is torch's:
-an operation on both devices is an error, unless all that is on the CPU is a single number.
+FakeTensorMode, which is meant for this, ends the process where a fake CUDA tensor requires a
+gradient and torch is built without CUDA. Here values are real, so a whole training runs, backward
+and optimizer too, and the rule is torch's: an operation on both devices is an error, unless all
+that is on the CPU is a single number.
 """
 
 from __future__ import annotations
@@ -21,22 +23,73 @@ from torch.utils._pytree import tree_leaves
 aten = torch.ops.aten
 GPU = torch.device("cuda", 0)
 CPU = torch.device("cpu")
-FACTORIES = {torch.zeros, torch.ones, torch.full, torch.empty, torch.eye, torch.arange, torch.tensor, torch.as_tensor}
-FACTORIES |= {torch.from_numpy, torch.rand, torch.randn, torch.randint, torch.randperm, torch.linspace}
+FACTORIES = {
+    torch.zeros,
+    torch.ones,
+    torch.full,
+    torch.empty,
+    torch.eye,
+    torch.arange,
+    torch.tensor,
+    torch.as_tensor,
+}
+FACTORIES |= {
+    torch.from_numpy,
+    torch.rand,
+    torch.randn,
+    torch.randint,
+    torch.randperm,
+    torch.linspace,
+}
 JOINING = {aten.cat.default, aten.stack.default}  # not even a single number may lie elsewhere
-INDEXING = {aten.index.Tensor, aten.index_put_.default, aten.index_put.default, aten._unsafe_index.Tensor}
-INDEXING |= {aten.index_fill_.int_Scalar}  # `x[i] = 0` in torch 2.15; with i elsewhere, a GPU's takes index_put_
-WAITING = {aten.nonzero.default, aten._unique2.default, aten.masked_select.default, aten.unique_consecutive.default}
+INDEXING = {
+    aten.index.Tensor,
+    aten.index_put_.default,
+    aten.index_put.default,
+    aten._unsafe_index.Tensor,
+}
+# `x[i] = 0` in torch 2.15; with i elsewhere, a GPU's takes index_put_
+INDEXING |= {aten.index_fill_.int_Scalar}
+WAITING = {
+    aten.nonzero.default,
+    aten._unique2.default,
+    aten.masked_select.default,
+    aten.unique_consecutive.default,
+}
 PURGE_EVERY = 5000  # operations
-VIEWS = {aten.view.default, aten.detach.default, aten.t.default, aten.alias.default, aten.expand.default}
-VIEWS |= {aten._unsafe_view.default, aten.permute.default, aten.transpose.int, aten.unsqueeze.default}
-VIEWS |= {aten.select.int, aten.slice.Tensor, aten.unbind.int, aten.as_strided.default, aten._reshape_alias.default}
+VIEWS = {
+    aten.view.default,
+    aten.detach.default,
+    aten.t.default,
+    aten.alias.default,
+    aten.expand.default,
+}
+VIEWS |= {
+    aten._unsafe_view.default,
+    aten.permute.default,
+    aten.transpose.int,
+    aten.unsqueeze.default,
+}
+VIEWS |= {
+    aten.select.int,
+    aten.slice.Tensor,
+    aten.unbind.int,
+    aten.as_strided.default,
+    aten._reshape_alias.default,
+}
 VIEWS |= {aten.split.Tensor, aten.split_with_sizes.default, aten.squeeze.dim, aten.squeeze.default}
-VIEWS |= {aten.empty.memory_format, aten.empty_like.default, aten.new_empty_strided.default, aten.lift_fresh.default}
+VIEWS |= {
+    aten.empty.memory_format,
+    aten.empty_like.default,
+    aten.new_empty_strided.default,
+    aten.lift_fresh.default,
+}
 
 
 class Moved(NamedTuple):
-    """kind: `up` to the GPU, `down` from it, or `wait` for a number of elements that only the GPU knows."""
+    """kind: `up` to the GPU, `down` from it, or `wait` for a number of elements that only the GPU
+    knows.
+    """
 
     kind: str
     shape: tuple[int, ...]
@@ -44,11 +97,12 @@ class Moved(NamedTuple):
 
 
 class SimulatedGpu:
-    """While `active()`, "cuda" is a device; `moved` records what was copied between it and the CPU, and `launches`
-    counts the operations that a GPU computes, a CUDA graph for one.
+    """While `active()`, "cuda" is a device; `moved` records what was copied between it and the CPU,
+    and `launches` counts the operations that a GPU computes, a CUDA graph for one.
 
-    Choices: where a tensor lies is kept by storage, so that views and operations in place lie where their base does;
-      on the CPU, where nothing is kept. What autograd makes of nothing lies nowhere, and fits everything.
+    Choices: where a tensor lies is kept by storage, so that views and operations in place lie where
+      their base does; on the CPU, where nothing is kept. What autograd makes of nothing lies
+      nowhere, and fits everything.
     """
 
     def __init__(self) -> None:
@@ -67,8 +121,12 @@ class SimulatedGpu:
         finally:
             torch.cuda.make_graphed_callables = graphed
 
-    def graphed(self, function: Any, samples: Any, warm_ups: int = 3, allow_unused_input: bool = False) -> Any:
-        """As `torch.cuda.make_graphed_callables`: what it is given is copied, what it returns is overwritten."""
+    def graphed(
+        self, function: Any, samples: Any, warm_ups: int = 3, allow_unused_input: bool = False
+    ) -> Any:
+        """As `torch.cuda.make_graphed_callables`: what it is given is copied, what it returns is
+        overwritten.
+        """
         kept: dict[str, Tensor] = {}
 
         def replayed(*arguments: Tensor) -> dict[str, Tensor]:
@@ -88,7 +146,9 @@ class SimulatedGpu:
         return replayed
 
     def apart(self, function: Any, samples: Any, arguments: Any) -> dict[str, Tensor]:
-        """function(*samples), a dictionary, as if of the arguments; what is computed in it and back is not counted."""
+        """function(*samples), a dictionary, as if of the arguments; what is computed in it and back
+        is not counted.
+        """
         gpu, names, inner = self, [], []
 
         class Apart(torch.autograd.Function):
@@ -108,7 +168,10 @@ class SimulatedGpu:
                 leaves = [sample for sample in samples if sample.requires_grad]
                 with gpu.uncounted():
                     found = torch.autograd.grad(values, leaves, slopes, allow_unused=True)
-                return tuple(dict(zip(map(id, leaves), found, strict=True)).get(id(sample)) for sample in samples)
+                return tuple(
+                    dict(zip(map(id, leaves), found, strict=True)).get(id(sample))
+                    for sample in samples
+                )
 
         return dict(zip(names, Apart.apply(*arguments), strict=True))
 
@@ -136,10 +199,15 @@ class SimulatedGpu:
     def record(self, kind: str, tensor: Tensor, what: str) -> None:
         if self.counting:
             frame = sys._getframe(1)
-            while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] != "chebsplat":
+            while (
+                frame.f_back is not None
+                and frame.f_globals.get("__name__", "").partition(".")[0] != "chebsplat"
+            ):
                 frame = frame.f_back
             with torch._C.DisableTorchFunction():
-                self.moved.append(Moved(kind, tuple(tensor.shape), f"{what} in {frame.f_code.co_qualname}"))
+                self.moved.append(
+                    Moved(kind, tuple(tensor.shape), f"{what} in {frame.f_code.co_qualname}")
+                )
 
     def purge(self) -> None:
         """Forget storages that nobody else holds."""
@@ -176,7 +244,9 @@ class _Operations(TorchDispatchMode):
                 gpu.put(tensor, GPU if on_gpu else None)
         return out
 
-    def _check(self, func: Any, args: Any, inputs: list[Tensor], places: list[torch.device | None]) -> None:
+    def _check(
+        self, func: Any, args: Any, inputs: list[Tensor], places: list[torch.device | None]
+    ) -> None:
         aside = [tensor for tensor, place in zip(inputs, places, strict=True) if place == CPU]
         if func is aten.copy_.default:
             self.gpu.record("up" if places[0] == GPU else "down", inputs[1], str(func))
@@ -184,8 +254,14 @@ class _Operations(TorchDispatchMode):
             for tensor in aside:
                 if tensor.ndim:
                     self.gpu.record("up", tensor, str(func))
-        elif func in JOINING or any(tensor.ndim for tensor in aside) or (places[0] == CPU and func._schema.is_mutable):
-            shapes = [f"{tuple(t.shape)} on {place}" for t, place in zip(inputs, places, strict=True)]
+        elif (
+            func in JOINING
+            or any(tensor.ndim for tensor in aside)
+            or (places[0] == CPU and func._schema.is_mutable)
+        ):
+            shapes = [
+                f"{tuple(t.shape)} on {place}" for t, place in zip(inputs, places, strict=True)
+            ]
             raise RuntimeError(f"{func} mixes devices: {', '.join(shapes)}")
 
 
@@ -204,7 +280,9 @@ class _Functions(TorchFunctionMode):
             with self:
                 return torch.autograd.backward(args[0], kwargs.pop("gradient", None), **kwargs)
         if func in (Tensor.numpy, Tensor.__array__) and gpu.place(args[0]) == GPU:
-            raise TypeError("can't convert cuda:0 device type tensor to numpy; copy it to the CPU first")
+            raise TypeError(
+                "can't convert cuda:0 device type tensor to numpy; copy it to the CPU first"
+            )
         if func is Tensor.tolist and gpu.place(args[0]) == GPU:
             gpu.record("down", args[0], "tolist")
         if func in (Tensor.to, Tensor.cpu, Tensor.cuda, Tensor.type_as):
@@ -216,9 +294,15 @@ class _Functions(TorchFunctionMode):
         if func in FACTORIES and isinstance(made, Tensor):
             given = args[0] if args and isinstance(args[0], Tensor) else None
             if given is None or device is not None:
-                gpu.put(made, torch.device(device or "cpu") if device is None else _full(device), over=True)
+                gpu.put(
+                    made,
+                    torch.device(device or "cpu") if device is None else _full(device),
+                    over=True,
+                )
         elif func is Tensor.new_tensor:
-            gpu.put(made, _full(device) if device is not None else gpu.place(args[0]) or CPU, over=True)
+            gpu.put(
+                made, _full(device) if device is not None else gpu.place(args[0]) or CPU, over=True
+            )
             if gpu.place(made) == GPU:
                 gpu.record("up", made, "new_tensor")
         elif device is not None and isinstance(made, Tensor):

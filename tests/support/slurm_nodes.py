@@ -1,4 +1,6 @@
-"""A Slurm of its own on 127.0.0.1: munge, slurmctld and some slurmd of Debian's packages, as ordinary processes."""
+"""A Slurm of its own on 127.0.0.1: munge, slurmctld and some slurmd of Debian's packages, as
+ordinary processes.
+"""
 
 import os
 import shutil
@@ -17,7 +19,10 @@ PLACES = os.pathsep.join((os.environ.get("PATH", ""), "/usr/sbin", "/sbin"))
 MISSING = [name for name in PROGRAMS if shutil.which(name, path=PLACES) is None]
 WHY = f"{', '.join(MISSING)} not found: apt-get install --no-install-recommends munge slurm-wlm"
 if not MISSING and find_spec("snakemake_executor_plugin_slurm") is None:
-    MISSING, WHY = ["the extra slurm"], "Snakemake's plugin for Slurm is not installed: make cluster-test does"
+    MISSING, WHY = (
+        ["the extra slurm"],
+        ("Snakemake's plugin for Slurm is not installed: make cluster-test does"),
+    )
 
 CONF = """\
 ClusterName=here
@@ -47,7 +52,9 @@ SchedulerParameters=batch_sched_delay=0,sched_min_interval=0
 
 
 class Slurm:
-    """A cluster under way. `environment`: what makes Slurm's commands, here and within jobs, talk to it."""
+    """A cluster under way. `environment`: what makes Slurm's commands, here and within jobs, talk
+    to it.
+    """
 
     def __init__(self, folder, n_nodes, cpus):
         self.folder, self.processes = folder, {}
@@ -57,18 +64,31 @@ class Slurm:
         ports = [one.getsockname()[1] for one in bound]
         for one in bound:
             one.close()
-        host, user = socket.gethostname().split(".")[0], subprocess.check_output(["id", "-un"], text=True).strip()
+        host, user = (
+            socket.gethostname().split(".")[0],
+            subprocess.check_output(["id", "-un"], text=True).strip(),
+        )
         text = CONF.format(host=host, user=user, folder=folder, ports=ports)
         self.nodes = [f"n{k}" for k in range(1, n_nodes + 1)]
         for name, port in zip(self.nodes, ports[1:], strict=True):
-            text += f"NodeName={name} NodeHostname={host} NodeAddr=127.0.0.1 Port={port} CPUs={cpus} RealMemory=64000\n"
-        text += f"PartitionName=all Nodes={','.join(self.nodes)} Default=YES MaxTime=INFINITE State=UP\n"
+            text += (
+                f"NodeName={name} NodeHostname={host} NodeAddr=127.0.0.1 Port={port} "
+                f"CPUs={cpus} RealMemory=64000\n"
+            )
+        text += (
+            f"PartitionName=all Nodes={','.join(self.nodes)} Default=YES MaxTime=INFINITE "
+            "State=UP\n"
+        )
         (folder / "slurm.conf").write_text(text)
         for name in ("state", "bin"):
             (folder / name).mkdir()
-        # Snakemake's plugin takes SLURM_* from what a job runs: its srun has to be told where this cluster is.
+        # Snakemake's plugin takes SLURM_* from what a job runs: its srun has to be told where this
+        # cluster is.
         srun = folder / "bin/srun"
-        srun.write_text(f'#!/bin/sh\nSLURM_CONF={folder}/slurm.conf exec {shutil.which("srun", path=PLACES)} "$@"\n')
+        srun.write_text(
+            f"#!/bin/sh\nSLURM_CONF={folder}/slurm.conf exec "
+            f'{shutil.which("srun", path=PLACES)} "$@"\n'
+        )
         srun.chmod(0o755)
         path = os.pathsep.join((str(folder / "bin"), PLACES))
         self.environment = {"SLURM_CONF": str(folder / "slurm.conf"), "PATH": path}
@@ -104,7 +124,9 @@ class Slurm:
             time.sleep(0.1)
 
     def ask(self, *command):
-        done = subprocess.run(command, env=os.environ | self.environment, capture_output=True, text=True)
+        done = subprocess.run(
+            command, env=os.environ | self.environment, capture_output=True, text=True
+        )
         return done.stdout.splitlines()
 
     def states(self):
@@ -118,12 +140,17 @@ class Slurm:
         return None
 
     def at_work(self, node=""):
-        """Processes of jobs on a node, or on all, and of the slurmstepd above them, which leave the slurmd's tree."""
+        """Processes of jobs on a node, or on all, and of the slurmstepd above them, which leave the
+        slurmd's tree.
+        """
         found = set()
         for folder in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
                 words = (folder / "environ").read_bytes()
-                if f"SLURMD_NODENAME={node}".encode() in words and f"{self.folder}/bin".encode() in words:
+                if (
+                    f"SLURMD_NODENAME={node}".encode() in words
+                    and f"{self.folder}/bin".encode() in words
+                ):
                     found.add(int(folder.name))
         for number in list(found):
             with suppress(OSError):

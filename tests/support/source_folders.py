@@ -21,9 +21,13 @@ def image(path, size=(8, 6), value=100, mode="RGB"):
 
 
 def alone(folder, settings=SETTINGS):
-    """Fields of photos that come alone, as of a model that looks along z from places a metre apart."""
+    """Fields of photos that come alone, as of a model that looks along z from places a metre
+    apart.
+    """
     found, notes = photos._listed(folder)
-    model = model_of([shot.name for shot in found], [shot.size for shot in found], [shot.focal for shot in found])
+    model = model_of(
+        [shot.name for shot in found], [shot.size for shot in found], [shot.focal for shot in found]
+    )
     model.notes = notes
     return photos.read(folder, settings, model)
 
@@ -32,10 +36,25 @@ def model_of(names, sizes, focals):
     """A model without points; focals: 35 mm equivalents, None: 1.2 longer sides."""
     poses = np.tile(np.eye(4), (len(names), 1, 1))
     poses[:, 0, 3] = -np.arange(len(names))
-    longs = [max(size) * (1.2 if focal is None else focal / 36) for size, focal in zip(sizes, focals, strict=True)]
-    cameras = [["SIMPLE_PINHOLE", [long, w / 2, h / 2], w, h] for long, (w, h) in zip(longs, sizes, strict=True)]
+    longs = [
+        max(size) * (1.2 if focal is None else focal / 36)
+        for size, focal in zip(sizes, focals, strict=True)
+    ]
+    cameras = [
+        ["SIMPLE_PINHOLE", [long, w / 2, h / 2], w, h]
+        for long, (w, h) in zip(longs, sizes, strict=True)
+    ]
     none = np.zeros((0, 3))
-    return PhotoModel(names, cameras, np.arange(len(names)), poses, none, none, none[:, 0], none[:, :2].astype(int))
+    return PhotoModel(
+        names,
+        cameras,
+        np.arange(len(names)),
+        poses,
+        none,
+        none,
+        none[:, 0],
+        none[:, :2].astype(int),
+    )
 
 
 def save(path, data):
@@ -44,7 +63,9 @@ def save(path, data):
 
 
 def tiny(n=3, size=(8, 6)):
-    """Fields of n views of one grey, depth and label each, moved along x by 1 m a view: what `layouts` writes."""
+    """Fields of n views of one grey, depth and label each, moved along x by 1 m a view: what
+    `layouts` writes.
+    """
     width, height = size
     number = np.broadcast_to(np.arange(n)[:, None, None], (n, height, width))
     poses = np.tile(np.eye(4), (n, 1, 1))
@@ -64,7 +85,9 @@ def write_transforms(folder, n=3, **changes):
         matrix[0, 3] = k
         frames.append({"file_path": f"images/frame_{k + 9}", "transform_matrix": matrix.tolist()})
     document = {"w": 8, "h": 6, "fl_x": 10.0, "cx": 4, "cy": 3, "frames": frames} | changes
-    (folder / "transforms.json").write_text(json.dumps({k: v for k, v in document.items() if v != "absent"}))
+    (folder / "transforms.json").write_text(
+        json.dumps({k: v for k, v in document.items() if v != "absent"})
+    )
     return folder
 
 

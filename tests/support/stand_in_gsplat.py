@@ -1,7 +1,10 @@
-"""gsplat 1.5.3's `rasterization` and `spherical_harmonics` without a GPU: their signatures and rules, on our twins.
+"""gsplat 1.5.3's `rasterization` and `spherical_harmonics` without a GPU: their signatures and
+rules, on our twins.
 
-Its rules: shapes as its assertions have them, float32 on one GPU, channels in chunks whose count its kernels are made
-for, each of which overwrites the absolute gradient of the one before; radii by axis, [C, N, 2], int32.
+Its rules: shapes as its assertions have them, float32 on one GPU, channels in chunks whose count
+  its kernels are made
+for, each of which overwrites the absolute gradient of the one before; radii by axis, [C, N, 2],
+int32.
 """
 
 from __future__ import annotations
@@ -19,7 +22,8 @@ from chebsplat.splats.sh import basis
 NATIVE = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33, 64, 65, 128, 129, 256, 257, 512, 513)
 CEILING = 0.999
 asked: dict[str, Any] = {}  # the options of the last call
-within: list[Callable[[], AbstractContextManager[None]]] = []  # the last one makes what a call computes in
+# the last one makes what a call computes in
+within: list[Callable[[], AbstractContextManager[None]]] = []
 
 
 def rasterization(
@@ -58,9 +62,25 @@ def rasterization(
     rolling_shutter: int = 0,
     viewmats_rs: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    others = (radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, viewmats_rs, covars, sh_degree)
+    others = (
+        radial_coeffs,
+        tangential_coeffs,
+        thin_prism_coeffs,
+        ftheta_coeffs,
+        viewmats_rs,
+        covars,
+        sh_degree,
+    )
     assert all(value is None for value in others), "an option that chebsplat never gives"
-    assert not (packed or sparse_grad or distributed or segmented or with_ut or with_eval3d or rolling_shutter)
+    assert not (
+        packed
+        or sparse_grad
+        or distributed
+        or segmented
+        or with_ut
+        or with_eval3d
+        or rolling_shutter
+    )
     assert (radius_clip, camera_model, render_mode) == (0, "pinhole", "RGB")
     N, C, D = len(means), len(viewmats), colors.shape[-1]
     assert means.shape == (N, 3), means.shape
@@ -74,7 +94,10 @@ def rasterization(
     assert N > 0, "its kernels sort no empty scene"
     assert isinstance(width, int) and isinstance(height, int), (width, height)
     for tensor in (means, quats, scales, opacities, colors, viewmats, Ks):
-        assert tensor.dtype == torch.float32 and tensor.device.type == "cuda", (tensor.dtype, tensor.device)
+        assert tensor.dtype == torch.float32 and tensor.device.type == "cuda", (
+            tensor.dtype,
+            tensor.device,
+        )
     for first in range(0, D, channel_chunk):
         chunk = min(channel_chunk, D - first)
         padded = chunk if chunk in NATIVE else 1 << (chunk - 1).bit_length()
@@ -82,7 +105,9 @@ def rasterization(
             raise ValueError(f"Unsupported number of color channels: {chunk}")
         assert not absgrad or chunk == D, "a second chunk would overwrite the absolute gradient"
     asked.clear()
-    asked.update(channel_chunk=channel_chunk, packed=packed, absgrad=absgrad, rasterize_mode=rasterize_mode)
+    asked.update(
+        channel_chunk=channel_chunk, packed=packed, absgrad=absgrad, rasterize_mode=rasterize_mode
+    )
     meta: dict[str, Any] = {}
 
     def render(*gaussians: Tensor) -> tuple[Tensor, Tensor]:
@@ -98,11 +123,16 @@ def rasterization(
     return image, alpha, meta | {"radii": meta["radii"][..., None].expand(-1, -1, 2).int()}
 
 
-def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None) -> Tensor:
+def spherical_harmonics(
+    degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None = None
+) -> Tensor:
     assert masks is None, "an option that chebsplat never gives"
     assert (degrees_to_use + 1) ** 2 <= coeffs.shape[-2], coeffs.shape
     assert dirs.shape == (len(coeffs), 3) and coeffs.shape[-1] == 3
-    assert dirs.dtype == coeffs.dtype == torch.float32 and dirs.device.type == coeffs.device.type == "cuda"
+    assert (
+        dirs.dtype == coeffs.dtype == torch.float32
+        and dirs.device.type == coeffs.device.type == "cuda"
+    )
 
     def shine(coefficients: Tensor) -> tuple[Tensor]:
         values = basis(torch.nn.functional.normalize(dirs, dim=-1), degrees_to_use)
@@ -113,10 +143,14 @@ def spherical_harmonics(degrees_to_use: int, dirs: Tensor, coeffs: Tensor, masks
 
 
 class _Kernel(torch.autograd.Function):
-    """A function of tensors with all its operations, forward and backward, within what `within` says."""
+    """A function of tensors with all its operations, forward and backward, within what `within`
+    says.
+    """
 
     @staticmethod
-    def forward(ctx: Any, function: Callable[..., tuple[Tensor, ...]], *inputs: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, function: Callable[..., tuple[Tensor, ...]], *inputs: Tensor
+    ) -> tuple[Tensor, ...]:
         ctx.inputs = [tensor.detach().requires_grad_(tensor.requires_grad) for tensor in inputs]
         with _aside(), torch.set_grad_enabled(any(tensor.requires_grad for tensor in inputs)):
             ctx.outputs = function(*ctx.inputs)

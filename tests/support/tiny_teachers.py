@@ -9,7 +9,14 @@ from onnx import TensorProto, helper, numpy_helper
 COLORS = {"red": (1.0, -1.0, -1.0), "green": (-1.0, 1.0, -1.0), "blue": (-1.0, -1.0, 1.0)}
 
 
-def write_model(path, nodes, outputs=("features",), shape=(1, 3, "H", "W"), kind=TensorProto.FLOAT, constants=None):
+def write_model(
+    path,
+    nodes,
+    outputs=("features",),
+    shape=(1, 3, "H", "W"),
+    kind=TensorProto.FLOAT,
+    constants=None,
+):
     """An ONNX file of nodes that read `image`; constants by name."""
     entry = helper.make_tensor_value_info("image", kind, shape)
     results = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in outputs]
@@ -21,18 +28,24 @@ def write_model(path, nodes, outputs=("features",), shape=(1, 3, "H", "W"), kind
 
 
 def ending(path, *nodes, outputs=None, constants=None):
-    """Put nodes that read `features` at the end of a model: (operator, its other inputs, attributes)."""
+    """Put nodes that read `features` at the end of a model: (operator, its other inputs,
+    attributes).
+    """
     model = onnx.load(path)
     name = "features"
     for k, (operator, inputs, attributes) in enumerate(nodes):
         result = f"features{k}"
         model.graph.node.append(helper.make_node(operator, [name, *inputs], [result], **attributes))
         name = result
-    held = [numpy_helper.from_array(np.asarray(value), of) for of, value in (constants or {}).items()]
+    held = [
+        numpy_helper.from_array(np.asarray(value), of) for of, value in (constants or {}).items()
+    ]
     model.graph.initializer.extend(held)
     del model.graph.output[:]
     kept = outputs or [name]
-    model.graph.output.extend(helper.make_tensor_value_info(of, TensorProto.FLOAT, None) for of in kept)
+    model.graph.output.extend(
+        helper.make_tensor_value_info(of, TensorProto.FLOAT, None) for of in kept
+    )
     onnx.save(model, path)
     return path
 
@@ -40,7 +53,14 @@ def ending(path, *nodes, outputs=None, constants=None):
 def moved_out(path, location):
     """Put a model's weights into a file beside it, as exporters do with many."""
     model = onnx.load(path)
-    onnx.save(model, path, save_as_external_data=True, location=location, size_threshold=0, convert_attribute=True)
+    onnx.save(
+        model,
+        path,
+        save_as_external_data=True,
+        location=location,
+        size_threshold=0,
+        convert_attribute=True,
+    )
 
 
 def write_settings(path, **values):
@@ -57,7 +77,8 @@ def write_table(path, names=tuple(COLORS), embeddings=None):
 
 
 def color_teacher(folder, stride=4, channels=3, weights=None, shape=(1, 3, "H", "W"), **settings):
-    """Mean colour of stride x stride pixels, through a matrix [channels, 3] where one is given; in `folder`/tiny.onnx.
+    """Mean colour of stride x stride pixels, through a matrix [channels, 3] where one is given; in
+    `folder`/tiny.onnx.
 
     A pixel's feature is its colour in [-1, 1], so that it is nearest to the name of its colour.
     """
@@ -71,11 +92,15 @@ def color_teacher(folder, stride=4, channels=3, weights=None, shape=(1, 3, "H", 
 
 
 def knowing_rooms(path):
-    """The same teacher, whose table has the classes of generated rooms, too, each beside a colour."""
+    """The same teacher, whose table has the classes of generated rooms, too, each beside a
+    colour.
+    """
     from chebsplat.synthetic import CLASS_NAMES
 
     names = (*COLORS, *CLASS_NAMES)
-    write_table(path.with_name("tiny.npz"), names, np.random.default_rng(0).normal(size=(len(names), 3)))
+    write_table(
+        path.with_name("tiny.npz"), names, np.random.default_rng(0).normal(size=(len(names), 3))
+    )
     return path
 
 

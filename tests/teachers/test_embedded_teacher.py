@@ -1,4 +1,6 @@
-"""The embedded teacher that ships: it runs, is as good as its figures say, and never saw what it is measured on."""
+"""The embedded teacher that ships: it runs, is as good as its figures say, and never saw what it is
+measured on.
+"""
 
 import json
 import tomllib
@@ -24,14 +26,17 @@ def test_any_size_that_is_a_multiple_gives_unit_vectors_as_wide_as_the_text(enco
     found = encoder.run(image, "noise")
     assert found.shape == (384, size[0] // 2, size[1] // 2)
     assert found.dtype == np.float32
-    np.testing.assert_allclose(np.linalg.norm(found, axis=0), 1, atol=2e-3)  # the map's columns are float16
+    # the map's columns are float16
+    np.testing.assert_allclose(np.linalg.norm(found, axis=0), 1, atol=2e-3)
 
 
 def test_the_rank_of_its_features_is_small(encoder):
     from chebsplat.teachers.network import RANK
 
     image = np.random.default_rng(0).integers(0, 256, (96, 96, 3), np.uint8)
-    sizes = np.linalg.svd(encoder.run(image, "noise").reshape(384, -1).astype(np.float64), compute_uv=False)
+    sizes = np.linalg.svd(
+        encoder.run(image, "noise").reshape(384, -1).astype(np.float64), compute_uv=False
+    )
     assert sizes[RANK] < 1e-5 * sizes[0]
 
 
@@ -47,13 +52,16 @@ def test_a_held_out_room_is_told_about_as_well_as_the_published_figures_say():
     for image, truth in held_out_room(layout.HELD_OUT[0], n_views=4):
         matrix += confusion(labelled(encode(image), texts, *truth.shape), truth, n)
     assert published["miou"] >= 0.55
-    assert segmentation(matrix).miou == pytest.approx(published["miou"], abs=0.15)  # one room of twenty, four views
+    # one room of twenty, four views
+    assert segmentation(matrix).miou == pytest.approx(published["miou"], abs=0.15)
     assert segmentation(matrix).oa == pytest.approx(published["oa"], abs=0.08)
 
 
 def test_no_seed_serves_two_ends():
     ranges = [layout.SCENES, layout.REFERENCE, layout.HELD_OUT, layout.TRAINING, layout.KNOWLEDGE]
-    assert ranges == sorted((r for r in vars(layout).values() if isinstance(r, range)), key=lambda r: r.start)
+    assert ranges == sorted(
+        (r for r in vars(layout).values() if isinstance(r, range)), key=lambda r: r.start
+    )
     assert all(a.stop <= b.start for a, b in pairwise(ranges))
     for path in (ROOT / "pipelines/configs/scenes").glob("*.toml"):
         source = tomllib.loads(path.read_text())["source"]
@@ -75,6 +83,8 @@ def test_words_that_measure_are_not_words_that_trained():
     from chebsplat.teachers.words import words
 
     training, unseen = words("training"), words("unseen")
-    assert not {w for of in training.values() for w in of} & {w for of in unseen.values() for w in of}
+    assert not {w for of in training.values() for w in of} & {
+        w for of in unseen.values() for w in of
+    }
     assert all(of[0] == name for name, of in training.items())
     assert len({len(of) for of in unseen.values()}) == 1

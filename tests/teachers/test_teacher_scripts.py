@@ -1,4 +1,6 @@
-"""The export scripts of docs/teachers.md run as they stand, on small stand-ins with the real models' interface."""
+"""The export scripts of docs/teachers.md run as they stand, on small stand-ins with the real
+models' interface.
+"""
 
 import re
 import sys
@@ -13,9 +15,13 @@ from shared import ROOT
 from chebsplat.stages.tools.get_teacher import check
 
 TEXT = (ROOT / "docs/teachers.md").read_text()
-SCRIPTS = {name: "# " + body for name, body in re.findall(r"```python\n# (?=(\w+)\.py)(.*?)```", TEXT, re.DOTALL)}
+SCRIPTS = {
+    name: "# " + body
+    for name, body in re.findall(r"```python\n# (?=(\w+)\.py)(.*?)```", TEXT, re.DOTALL)
+}
 SETTINGS = {
-    re.search(r'name = "(\w+)"', block)[1]: block for block in re.findall(r"```toml\n(.*?)```", TEXT, re.DOTALL)
+    re.search(r'name = "(\w+)"', block)[1]: block
+    for block in re.findall(r"```toml\n(.*?)```", TEXT, re.DOTALL)
 }
 NAMES = ["wall", "floor", "chair"]
 
@@ -27,18 +33,24 @@ def conv(n_in, n_out, stride=1):
 class Fusion(torch.nn.Module):
     def forward(self, path, skip=None):
         path = path if skip is None else path + skip
-        return torch.nn.functional.interpolate(path, scale_factor=2, mode="bilinear", align_corners=True)
+        return torch.nn.functional.interpolate(
+            path, scale_factor=2, mode="bilinear", align_corners=True
+        )
 
 
 class LSegNet(torch.nn.Module):
-    """Layers at 1/4 to 1/32 of the image through hooks, fused to half of it, and a text encoder that halves floats."""
+    """Layers at 1/4 to 1/32 of the image through hooks, fused to half of it, and a text encoder
+    that halves floats.
+    """
 
     def __init__(self, labels, backbone, features, crop_size, arch_option, block_depth, activation):
         super().__init__()
         clip = sys.modules["clip"]
         self.clip_pretrained, _ = clip.load("ViT-B/32", device="cuda", jit=False)
         self.pretrained = torch.nn.Module()
-        self.pretrained.layers = torch.nn.ModuleList([conv(3, 8, 4), conv(8, 8, 2), conv(8, 8, 2), conv(8, 8, 2)])
+        self.pretrained.layers = torch.nn.ModuleList(
+            [conv(3, 8, 4), conv(8, 8, 2), conv(8, 8, 2), conv(8, 8, 2)]
+        )
         self.scratch = torch.nn.Module()
         for k in range(1, 5):
             setattr(self.scratch, f"layer{k}_rn", conv(8, 8))
@@ -68,7 +80,9 @@ class DinoTxt(torch.nn.Module):
         return tokens.mean(1), tokens
 
     def encode_text(self, tokens):
-        return torch.cat([torch.full((len(tokens), 96), torch.nan), torch.randn(len(tokens), 96)], 1)
+        return torch.cat(
+            [torch.full((len(tokens), 96), torch.nan), torch.randn(len(tokens), 96)], 1
+        )
 
 
 class Segmenter(torch.nn.Module):
@@ -93,17 +107,26 @@ def stand_ins(monkeypatch, tmp_path):
 
     module("clip", load=lambda name, device, jit: (ClipText(), None))
     net = LSegNet(NAMES, "", 0, 0, 0, 0, "")
-    module("clip", load=load, tokenize=lambda names: torch.arange(1, 1 + len(names))[:, None].float())
+    module(
+        "clip", load=load, tokenize=lambda names: torch.arange(1, 1 + len(names))[:, None].float()
+    )
     for name in ("modules", "modules.models", "dinov2", "dinov2.hub"):
         module(name)
     module("modules.models.lseg_net", LSegNet=LSegNet)
     module("modules.models.lseg_vit", forward_vit=forward_vit)
     tokenizer = types.SimpleNamespace(tokenize=lambda texts: torch.zeros(len(texts), 77))
-    module("dinov2.hub.dinotxt", dinov2_vitl14_reg4_dinotxt_tet1280d20h24l=DinoTxt, get_tokenizer=lambda: tokenizer)
+    module(
+        "dinov2.hub.dinotxt",
+        dinov2_vitl14_reg4_dinotxt_tet1280d20h24l=DinoTxt,
+        get_tokenizer=lambda: tokenizer,
+    )
     loader = types.SimpleNamespace(from_pretrained=lambda name: Segmenter())
     module("transformers", AutoModelForSemanticSegmentation=loader)
     (tmp_path / "labels.txt").write_text("\n".join(NAMES) + "\n")
-    held = {"state_dict": {f"net.{k}": v for k, v in net.state_dict().items()} | {"criterion.weight": torch.ones(3)}}
+    held = {
+        "state_dict": {f"net.{k}": v for k, v in net.state_dict().items()}
+        | {"criterion.weight": torch.ones(3)}
+    }
     torch.save(held, tmp_path / "demo_e200.ckpt")
     monkeypatch.chdir(tmp_path)
     space = {}
@@ -128,7 +151,9 @@ def test_an_export_script_of_the_document_makes_a_teacher(name, tmp_path, monkey
         exec(compile(SCRIPTS[name], f"{name}.py", "exec"), {"__name__": "__main__"})
     lines = SETTINGS[name].splitlines()
     drop = ("text", "tokenizer", "prompt") if name == "lseg" else ()
-    (tmp_path / f"{name}.toml").write_text("\n".join(line for line in lines if not line.startswith(drop or "-")))
+    (tmp_path / f"{name}.toml").write_text(
+        "\n".join(line for line in lines if not line.startswith(drop or "-"))
+    )
     pixels = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8)
     Image.fromarray(pixels).save(tmp_path / "photo.png")
     found = dict(check(tmp_path / f"{name}.onnx", [tmp_path / "photo.png"]))

@@ -35,7 +35,17 @@ PACKAGES = {
     "shape": {"cameras", "kernels", "settings", "splats"},
     "lifting": {"cameras", "kernels", "labels", "rasterize", "render", "splats", "views"},
     "evaluation": {"labels", "splats"},
-    "training": {"cameras", "evaluation", "kernels", "printed", "rasterize", "settings", "shape", "splats", "views"},
+    "training": {
+        "cameras",
+        "evaluation",
+        "kernels",
+        "printed",
+        "rasterize",
+        "settings",
+        "shape",
+        "splats",
+        "views",
+    },
 }
 SOURCES = [p for layer in LAYERS for p in sorted((ROOT / layer).rglob("*.py"))]
 
@@ -63,29 +73,47 @@ def test_imports_run_one_way(path):
 
 def test_packages_of_the_maths_import_one_another_one_way():
     order = list(PACKAGES)
-    assert all(order.index(below) < order.index(name) for name, allowed in PACKAGES.items() for below in allowed)
+    assert all(
+        order.index(below) < order.index(name)
+        for name, allowed in PACKAGES.items()
+        for below in allowed
+    )
     folder = ROOT / "chebsplat"
     assert len(list(folder.glob("*.py"))) <= 6
     found = {}
     for path in folder.rglob("*.py"):
         own = path.relative_to(folder).with_suffix("").parts[0]
-        names = [name.split(".") for name in imported_modules(path) if name.startswith("chebsplat.")]
-        found.setdefault(own, set()).update(parts[1] for parts in names if parts[1] not in (own, "errors"))
+        names = [
+            name.split(".") for name in imported_modules(path) if name.startswith("chebsplat.")
+        ]
+        found.setdefault(own, set()).update(
+            parts[1] for parts in names if parts[1] not in (own, "errors")
+        )
     found = {own: imported for own, imported in found.items() if own not in ("__init__", "errors")}
     assert found == PACKAGES
 
 
 def test_the_printed_method_stays_short_enough_to_be_read_beside_the_paper():
-    assert sum(len(path.read_text().splitlines()) for path in (ROOT / "chebsplat/printed").glob("*.py")) <= 1100
+    assert (
+        sum(
+            len(path.read_text().splitlines()) for path in (ROOT / "chebsplat/printed").glob("*.py")
+        )
+        <= 1100
+    )
 
 
 def test_of_pipelines_only_the_command_knows_studies():
     for path in (ROOT / "pipelines").rglob("*.py"):
         if path.relative_to(ROOT / "pipelines").parts[0] not in ("studies", "cli"):
-            assert not [name for name in imported_modules(path) if name.startswith("chebsplat.pipelines.studies")], path
+            assert not [
+                name
+                for name in imported_modules(path)
+                if name.startswith("chebsplat.pipelines.studies")
+            ], path
 
 
-# Rooms of stages/ and pipelines/: each may import those before it that it names. A single module is named by its file.
+# Rooms of stages/ and pipelines/: each may import those before it that it names. A single module is
+# named by its file.
 ROOMS = {
     "stages": {
         "registry": set(),
@@ -98,7 +126,15 @@ ROOMS = {
         "training": {"runtime", "settings"},
         "teacher_models": {"runtime", "settings"},
         "shape_models": {"reconstruction", "runtime", "settings", "sources", "teacher_models"},
-        "tools": {"pages", "runtime", "settings", "shape_models", "sources", "teacher_models", "training"},
+        "tools": {
+            "pages",
+            "runtime",
+            "settings",
+            "shape_models",
+            "sources",
+            "teacher_models",
+            "training",
+        },
     },
     "pipelines": {
         "work": set(),
@@ -111,7 +147,10 @@ ROOMS = {
         "cli": {"api", "bases", "planning", "running", "selection", "studies", "work"},
     },
 }
-STAGE_MODULES = {path.stem for path in (ROOT / "stages").glob("*.py")} - {"__init__", *ROOMS["stages"]}
+STAGE_MODULES = {path.stem for path in (ROOT / "stages").glob("*.py")} - {
+    "__init__",
+    *ROOMS["stages"],
+}
 ALSO_STAGES = {"tools"}  # commands on finished scenes run stages
 
 
@@ -128,7 +167,11 @@ MODULES = {module_of(path): path for path in SOURCES}
 def imported_by(path):
     """Modules of ours that a module imports, at its top or inside a function."""
     names = set(imported_modules(path))
-    found = {name if name in MODULES else name.rpartition(".")[0] for name in names if name.startswith("chebsplat.")}
+    found = {
+        name if name in MODULES else name.rpartition(".")[0]
+        for name in names
+        if name.startswith("chebsplat.")
+    }
     return (found & MODULES.keys()) - {module_of(path)}
 
 
@@ -139,7 +182,11 @@ def test_rooms_import_one_another_one_way(layer):
         if not module.startswith(f"chebsplat.{layer}."):
             continue
         here = module.split(".")[2]
-        theirs = {name.split(".")[2] for name in imported_by(path) if name.startswith(f"chebsplat.{layer}.")}
+        theirs = {
+            name.split(".")[2]
+            for name in imported_by(path)
+            if name.startswith(f"chebsplat.{layer}.")
+        }
         allowed = rooms.get(here, rooms.keys() - {"tools"}) | {here}
         allowed |= STAGE_MODULES if here in ALSO_STAGES else set()
         wrong += [f"{module}: {name}" for name in sorted(theirs - allowed)]
@@ -148,7 +195,8 @@ def test_rooms_import_one_another_one_way(layer):
 
 def test_no_imports_run_in_a_circle():
     graph = {module: imported_by(path) for module, path in MODULES.items()}
-    TopologicalSorter(graph).prepare()  # or CycleError, which names it; `cli.runs` loads its group at run time
+    # or CycleError, which names it; `cli.runs` loads its group at run time
+    TopologicalSorter(graph).prepare()
 
 
 def test_formats_know_no_torch():
@@ -163,7 +211,9 @@ def test_a_stage_is_known_by_every_kernel_it_runs_and_every_package_it_loads():
     code = Code(PACKAGE, found)
     for stage in ("sfm", "describe", "train", "lift", "refine"):
         code.stage(stage)
-    kernels = [path for path in PACKAGE.rglob("*.py") if "chebsplat.kernels.jit import" in path.read_text()]
+    kernels = [
+        path for path in PACKAGE.rglob("*.py") if "chebsplat.kernels.jit import" in path.read_text()
+    ]
     assert len(kernels) > 8
     assert not [path for path in kernels if str(path) not in found]
     assert {"onnx", "onnxruntime", "torch"} <= set(code.stage("onnx")["packages"])
@@ -174,16 +224,28 @@ def test_tools_that_walk_the_links_see_each_file_once(tmp_path):
     from mypy.options import Options
 
     listed = subprocess.run(
-        [sys.executable, "-m", "ruff", "check", "--show-files", *LAYERS], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-m", "ruff", "check", "--show-files", *LAYERS],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
     )
     shown = [Path(line) for line in listed.stdout.splitlines()]
     assert sorted(path for path in shown if path.suffix == ".py") == sorted(SOURCES)
     finder = FindModuleCache(SearchPaths((str(ROOT),), (), (), ()), None, Options())
-    typed = [Path(module.path).resolve() for module in finder.find_modules_recursive("chebsplat") if module.path]
+    typed = [
+        Path(module.path).resolve()
+        for module in finder.find_modules_recursive("chebsplat")
+        if module.path
+    ]
     assert sorted(path for path in typed if path.suffix == ".py") == sorted(SOURCES)
     command = [sys.executable, "-P", "-m", "coverage"]
     traced = os.environ | {"COVERAGE_FILE": str(tmp_path / "data")}
-    for words in (["run", "-m", "chebsplat.pipelines.cli", "settings"], ["json", "-q", "-o", str(tmp_path / "json")]):
+    for words in (
+        ["run", "-m", "chebsplat.pipelines.cli", "settings"],
+        ["json", "-q", "-o", str(tmp_path / "json")],
+    ):
         subprocess.run([*command, *words], cwd=ROOT, env=traced, check=True, capture_output=True)
-    covered = [(ROOT / name).resolve() for name in json.loads((tmp_path / "json").read_text())["files"]]
+    covered = [
+        (ROOT / name).resolve() for name in json.loads((tmp_path / "json").read_text())["files"]
+    ]
     assert sorted(covered) == sorted(SOURCES)

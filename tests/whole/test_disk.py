@@ -1,4 +1,6 @@
-"""A disk that is full, read-only or not ours ends a command with exit code 4, the file, the bytes and no traceback."""
+"""A disk that is full, read-only or not ours ends a command with exit code 4, the file, the bytes
+and no traceback.
+"""
 
 import errno
 import json
@@ -31,7 +33,18 @@ def on_a_disk(folder, options, *arguments):
     """A `chebsplat` command whose work folder, or another, is a disk of its own."""
     if (unshare := namespace()) is None:
         pytest.skip("nothing can be mounted here (root, or user namespaces, are needed)")
-    command = [*unshare, "sh", "-c", MOUNT, options, folder, sys.executable, "-P", "-m", "chebsplat.pipelines.cli"]
+    command = [
+        *unshare,
+        "sh",
+        "-c",
+        MOUNT,
+        options,
+        folder,
+        sys.executable,
+        "-P",
+        "-m",
+        "chebsplat.pipelines.cli",
+    ]
     env = {"CHEBSPLAT_WORK": str(folder)} | os.environ
     return subprocess.run([*command, *arguments], cwd=ROOT, env=env, capture_output=True, text=True)
 
@@ -64,17 +77,28 @@ def test_a_home_folder_that_takes_nothing_stops_no_run(tmp_path, monkeypatch):
 
 
 def in_a_shell(folder, words, buffered="", before=""):
-    """A `chebsplat` command in a shell, whose streams `words` may redirect; its work folder is `folder`; `before`:
-    what the shell does first.
+    """A `chebsplat` command in a shell, whose streams `words` may redirect; its work folder is
+    `folder`; `before`: what the shell does first.
     """
-    env = os.environ | {"CHEBSPLAT_WORK": str(folder), "PYTHONUNBUFFERED": buffered, "PYTHONPATH": str(ROOT)}
+    env = os.environ | {
+        "CHEBSPLAT_WORK": str(folder),
+        "PYTHONUNBUFFERED": buffered,
+        "PYTHONPATH": str(ROOT),
+    }
     command = f"{sys.executable} -P -m chebsplat.pipelines.cli {words}"
-    return subprocess.run(["sh", "-c", before + command], cwd=folder, env=env, capture_output=True, text=True)
+    return subprocess.run(
+        ["sh", "-c", before + command], cwd=folder, env=env, capture_output=True, text=True
+    )
 
 
 @pytest.mark.parametrize(
     ("words", "buffered"),
-    [("settings", "1"), ("settings --help", ""), ("--help", "1"), ("ingest --config toy.json --out made", "")],
+    [
+        ("settings", "1"),
+        ("settings --help", ""),
+        ("--help", "1"),
+        ("ingest --config toy.json --out made", ""),
+    ],
 )
 def test_a_full_standard_output_is_named_and_no_folder_is_blamed(tmp_path, words, buffered):
     (tmp_path / "toy.json").write_text(json.dumps(TOY))
@@ -87,7 +111,9 @@ def test_a_full_standard_output_is_named_and_no_folder_is_blamed(tmp_path, words
 
 
 @pytest.mark.parametrize(("closed", "printed"), [("2>&-", "{}/made\n"), ("<&- >&- 2>&-", "")])
-def test_closed_streams_keep_nothing_from_being_made_and_no_file_takes_their_place(tmp_path, closed, printed):
+def test_closed_streams_keep_nothing_from_being_made_and_no_file_takes_their_place(
+    tmp_path, closed, printed
+):
     (tmp_path / "toy.json").write_text(json.dumps(TOY))
     done = in_a_shell(tmp_path, f"ingest --config toy.json --out made {closed}")
     assert (done.returncode, done.stdout) == (0, printed.format(tmp_path))
@@ -101,7 +127,13 @@ def test_help_is_shown_in_a_folder_that_is_gone(tmp_path):
 
 
 def test_a_full_disk_is_recognised_behind_a_library_s_own_error(tmp_path):
-    manifest, said = Manifest("chebsplat.capture/2", "k", "ingest"), r"a\.bin cannot be .*more than 3 bytes are needed"
+    manifest, said = (
+        Manifest("chebsplat.capture/2", "k", "ingest"),
+        (
+            r"a\.bin cannot be .*more than 3 bytes are "
+            r"needed"
+        ),
+    )
     with pytest.raises(DiskFailure, match=said), artifact.publish(tmp_path / "x", manifest) as tmp:
         (tmp / "a.bin").write_bytes(b"abc")
         try:
@@ -115,14 +147,33 @@ def test_a_full_disk_is_recognised_behind_a_library_s_own_error(tmp_path):
     ("number", "state", "written", "said"),
     [
         (errno.ENOSPC, {}, 0, r"5 bytes are free in .*, and more are needed; make room and give"),
-        (errno.ENOSPC, {}, 3, r"more than 3 bytes are needed in .*, 5 are free beside those; make room and give"),
-        (errno.ENOSPC, {"f_favail": 0}, 3, r"holds as many files as it can; remove some, however small, and give"),
-        (errno.EDQUOT, {}, 3, r"your quota is used up, though 5 bytes are free; remove files of yours and give"),
+        (
+            errno.ENOSPC,
+            {},
+            3,
+            r"more than 3 bytes are needed in .*, 5 are free beside those; make "
+            r"room and give",
+        ),
+        (
+            errno.ENOSPC,
+            {"f_favail": 0},
+            3,
+            r"holds as many files as it can; remove some, however "
+            r"small, and give",
+        ),
+        (
+            errno.EDQUOT,
+            {},
+            3,
+            r"your quota is used up, though 5 bytes are free; remove files of "
+            r"yours and give",
+        ),
     ],
 )
 def test_a_full_disk_says_what_it_lacks(tmp_path, monkeypatch, number, state, written, said):
     disk = SimpleNamespace(
-        **{"f_bavail": 5, "f_bfree": 5, "f_blocks": 9, "f_frsize": 1, "f_files": 9, "f_favail": 4} | state
+        **{"f_bavail": 5, "f_bfree": 5, "f_blocks": 9, "f_frsize": 1, "f_files": 9, "f_favail": 4}
+        | state
     )
     monkeypatch.setattr(os, "statvfs", lambda path: disk)
     (tmp_path / "a.bin").write_bytes(bytes(written))

@@ -1,4 +1,6 @@
-"""What the pages name exists: files, what they define, other pages, settings, equations and artifacts."""
+"""What the pages name exists: files, what they define, other pages, settings, equations and
+artifacts.
+"""
 
 import ast
 import os
@@ -24,8 +26,12 @@ from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.config import known_keys
 from chebsplat.stages.training.defaults import DEFAULTS, OPEN
 
-PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").rglob("*.md"))
-CODE = re.compile(r"`([\w/]+\.py)(?::([\w.]+))?`|\b((?:chebsplat|formats|stages|pipelines)/[\w/]+\.py):(\w+)")
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted(
+    (ROOT / "docs").rglob("*.md")
+)
+CODE = re.compile(
+    r"`([\w/]+\.py)(?::([\w.]+))?`|\b((?:chebsplat|formats|stages|pipelines)/[\w/]+\.py):(\w+)"
+)
 LINK = re.compile(r"\]\(([^)#:]+)\)")
 RECORDS = (
     Capture, Points, ChannelMap, Features, ViewAgreement, Descriptors, Encoding, Checkpoint, Lifted, Refined,
@@ -49,7 +55,8 @@ def test_every_file_function_and_page_that_is_named_exists(page):
     text = page.read_text()
     for match in CODE.finditer(text):
         file, name = match[1] or match[3], match[2] or match[4]
-        if "/" not in file:  # a file of the reader's, or one of the folder that the sentence is about
+        # a file of the reader's, or one of the folder that the sentence is about
+        if "/" not in file:
             continue
         assert (ROOT / file).is_file(), match[0]
         assert name is None or name in defined(ROOT / file), match[0]
@@ -60,7 +67,9 @@ def test_every_file_function_and_page_that_is_named_exists(page):
 def test_the_method_names_where_each_equation_is_computed():
     text = (ROOT / "docs/method.md").read_text()
     named = set()
-    for first, printed, ours, worth in re.findall(r"^\| (.+?) \| (.+?) \| (.+?) \| (.+?) \|$", text, re.MULTILINE):
+    for first, printed, ours, worth in re.findall(
+        r"^\| (.+?) \| (.+?) \| (.+?) \| (.+?) \|$", text, re.MULTILINE
+    ):
         if numbers := re.match(r"Eqs? (\d+)(?:-(\d+))?, |pruning$|SH masks$|losses$", first):
             from_, to = numbers[1], numbers[2] or numbers[1]
             named |= set(range(int(from_), int(to) + 1)) if from_ else {first}
@@ -84,11 +93,15 @@ def test_the_architecture_names_reader_and_writer_of_each_artifact():
 
 
 def rows_of(record, prefix=""):
-    """Rows of the table of layouts: a record's arrays, those of records within, and its attributes."""
+    """Rows of the table of layouts: a record's arrays, those of records within, and its
+    attributes.
+    """
     layout = layout_of(record)
     for name, spec in layout.arrays.items():
         shape = ", ".join(map(str, spec.axes))
-        remarks = "; ".join(filter(None, (spec.units, "optional" if name in layout.optional else "")))
+        remarks = "; ".join(
+            filter(None, (spec.units, "optional" if name in layout.optional else ""))
+        )
         yield f"| `{prefix}{name}` | {spec.dtype} | {shape} | {remarks} |"
     for name, within in layout.records.items():
         yield from rows_of(within, f"{prefix}{name}/")
@@ -100,7 +113,10 @@ def rows_of(record, prefix=""):
 def test_the_architecture_lists_the_arrays_of_each_record():
     """CHEBSPLAT_WRITE_DOCS=1 writes the table anew."""
     page = ROOT / "docs/architecture.md"
-    begin, end = "<!-- layouts: written by tests/whole/test_docs.py -->\n", "<!-- end of layouts -->"
+    begin, end = (
+        "<!-- layouts: written by tests/whole/test_docs.py -->\n",
+        ("<!-- end of layouts -->"),
+    )
     lines = ["", "| array | dtype | axes | units |", "|---|---|---|---|"]
     for record in RECORDS:
         lines += [f"| **{record.SCHEMA.removeprefix('chebsplat.')}** | | | |", *rows_of(record)]
@@ -116,7 +132,10 @@ def test_the_architecture_lists_the_arrays_of_each_record():
 def test_usage_lists_each_setting_that_a_scene_decides():
     """CHEBSPLAT_WRITE_DOCS=1 writes the table anew."""
     page = ROOT / "docs/usage.md"
-    begin, end = "<!-- decided: written by tests/whole/test_docs.py -->\n", "<!-- end of decided -->"
+    begin, end = (
+        "<!-- decided: written by tests/whole/test_docs.py -->\n",
+        ("<!-- end of decided -->"),
+    )
     lines = ["", "| setting | decided by |", "|---|---|"]
     lines += [f"| `train.{name}` | {default.by} |" for name, default in DEFAULTS.items()]
     before, rest = page.read_text().split(begin)
@@ -145,7 +164,11 @@ def test_the_python_of_the_readme_renders_and_asks_a_scene(toy, tmp_path):
     for stage in ("export", "teacher"):
         (tmp_path / stage).symlink_to(toy[stage])
     name = Scene.read(toy["export"]).label_names[0]
-    for written, here in (("work/office0", tmp_path), ('"sofa"', f'"{name}", against=["{name}"]'), ("> 0.5", ">= 0")):
+    for written, here in (
+        ("work/office0", tmp_path),
+        ('"sofa"', f'"{name}", against=["{name}"]'),
+        ("> 0.5", ">= 0"),
+    ):
         assert written in code
         code = code.replace(written, str(here))
     found = {}
@@ -159,4 +182,6 @@ def test_the_readme_is_short_and_answers_a_newcomer():
     text = (ROOT / "README.md").read_text()
     assert len(text.split()) <= 900
     headings = re.findall(r"^## (.*)$", text, re.MULTILINE)
-    assert {"Install", "Your own photos", "Look at the result", "Use it from Python", "GPU"} <= set(headings)
+    assert {"Install", "Your own photos", "Look at the result", "Use it from Python", "GPU"} <= set(
+        headings
+    )

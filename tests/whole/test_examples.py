@@ -35,9 +35,12 @@ def test_the_notebook_runs_cell_by_cell(toy, monkeypatch, capsys):
     import matplotlib.pyplot as plt
 
     notebook = json.loads((EXAMPLES / "look_around.ipynb").read_text())
-    assert not any(cell.get("outputs") for cell in notebook["cells"])  # kept without, so that none is stale
+    # kept without, so that none is stale
+    assert not any(cell.get("outputs") for cell in notebook["cells"])
     names: dict = {}
-    for number, cell in enumerate(cell for cell in notebook["cells"] if cell["cell_type"] == "code"):
+    for number, cell in enumerate(
+        cell for cell in notebook["cells"] if cell["cell_type"] == "code"
+    ):
         exec(compile("".join(cell["source"]), f"look_around.ipynb, cell {number}", "exec"), names)
     assert names["answer"].selected.sum() > 0
     assert len(plt.get_fignums()) == 2
@@ -48,7 +51,10 @@ def test_the_notebook_runs_cell_by_cell(toy, monkeypatch, capsys):
 def test_photos_become_a_picture(tmp_path):
     command = [sys.executable, EXAMPLES / "photos_to_picture.py", "toy", tmp_path / "toy.png", "30"]
     done = subprocess.run(
-        command, cwd=tmp_path, env=os.environ | {"CHEBSPLAT_WORK": str(tmp_path / "work")}, capture_output=True
+        command,
+        cwd=tmp_path,
+        env=os.environ | {"CHEBSPLAT_WORK": str(tmp_path / "work")},
+        capture_output=True,
     )
     assert done.returncode == 0, done.stderr.decode()
     assert (tmp_path / "toy.png").stat().st_size > 1000

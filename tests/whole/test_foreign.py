@@ -1,4 +1,6 @@
-"""What lies where the user stands is never run, and nothing is told to anyone or left behind in the home folder."""
+"""What lies where the user stands is never run, and nothing is told to anyone or left behind in the
+home folder.
+"""
 
 import os
 import subprocess
@@ -10,16 +12,32 @@ import pytest
 from chebsplat.formats.teacher_model import EMBEDDED
 
 CHEBSPLAT = str(Path(sys.executable).with_name("chebsplat"))
-HOSTILE = ("humanfriendly", "click", "json", "yaml", "snakemake", "chebsplat", "formats", "numpy", "sitecustomize")
+HOSTILE = (
+    "humanfriendly",
+    "click",
+    "json",
+    "yaml",
+    "snakemake",
+    "chebsplat",
+    "formats",
+    "numpy",
+    "sitecustomize",
+)
 
 
 def chebsplat(folder, *arguments, **environment):
     """The command as a user calls it, from `folder`, with a home folder of its own."""
     (folder / "home").mkdir(exist_ok=True)
-    env = {name: value for name, value in os.environ.items() if not name.startswith(("CHEBSPLAT", "ORT_", "PYTHON"))}
+    env = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("CHEBSPLAT", "ORT_", "PYTHON"))
+    }
     env |= {"HOME": str(folder / "home")} | environment
     env.pop("XDG_CACHE_HOME", None)
-    return subprocess.run([CHEBSPLAT, *map(str, arguments)], capture_output=True, text=True, cwd=folder, env=env)
+    return subprocess.run(
+        [CHEBSPLAT, *map(str, arguments)], capture_output=True, text=True, cwd=folder, env=env
+    )
 
 
 @pytest.mark.xdist_group("cli")
@@ -28,7 +46,9 @@ def test_a_module_beside_the_photos_or_in_the_work_folder_is_never_run(tmp_path)
     for folder in (tmp_path, tmp_path / "work"):
         for name in HOSTILE:
             mark = folder / f"ran-{name}"
-            (folder / f"{name}.py").write_text(f"open({str(mark)!r}, 'w').close()\nraise SystemExit(9)\n")
+            (folder / f"{name}.py").write_text(
+                f"open({str(mark)!r}, 'w').close()\nraise SystemExit(9)\n"
+            )
     done = chebsplat(tmp_path, "run", "--scene", "toy", "--stage", "ingest")
     assert not list(tmp_path.glob("**/ran-*"))
     assert done.returncode == 0, done.stderr
@@ -38,7 +58,9 @@ def test_onnxruntime_keeps_no_identity_of_the_machine_in_the_home_folder(tmp_pat
     done = chebsplat(tmp_path, "check-teacher", EMBEDDED, TMPDIR=str(tmp_path))
     assert done.returncode == 0, done.stderr
     left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")}
-    assert not [path for path in left if any(word in path for word in ("onnx", "Microsoft", "deviceid"))]
+    assert not [
+        path for path in left if any(word in path for word in ("onnx", "Microsoft", "deviceid"))
+    ]
     assert ".ses" not in left  # a session's id
 
 

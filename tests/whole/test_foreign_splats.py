@@ -1,4 +1,6 @@
-"""Splats that others wrote, 150,000 of them, open in the page and the renderer: what is shown is theirs."""
+"""Splats that others wrote, 150,000 of them, open in the page and the renderer: what is shown is
+theirs.
+"""
 
 import chebsplat.kernels.jit  # noqa: F401  # isort: skip  # gsply runs on numba too: the threading layer is chosen first
 
@@ -52,7 +54,11 @@ def shown_in_both(ply, tmp_path):
     done = CliRunner().invoke(main, ["page", str(ply), "--out", str(out), "--sh", "1"])
     assert done.exit_code == 0, done.output
     about, arrays = held_in(out)
-    held = unpack(Packed({name: values for name, values in arrays.items() if name != "views"}, about["ranges"]))
+    held = unpack(
+        Packed(
+            {name: values for name, values in arrays.items() if name != "views"}, about["ranges"]
+        )
+    )
     return opened, shown.color, held, out
 
 
@@ -60,9 +66,13 @@ def test_150000_splats_of_gsply_open_in_renderer_and_page(written_by_gsply, tmp_
     parameters, ply = written_by_gsply
     opened, image, held, _ = shown_in_both(ply, tmp_path)
     assert len(opened) == len(held["means"]) == N
-    truth = SceneRenderer(parameters | {"degrees": np.ones(N, np.uint8)}).render(opened.cameras[0].view())[0]
+    truth = SceneRenderer(parameters | {"degrees": np.ones(N, np.uint8)}).render(
+        opened.cameras[0].view()
+    )[0]
     np.testing.assert_array_equal(image, truth)
-    np.testing.assert_array_equal(np.sort(opened.parameters["means"][:, 0]), np.sort(parameters["means"][:, 0]))
+    np.testing.assert_array_equal(
+        np.sort(opened.parameters["means"][:, 0]), np.sort(parameters["means"][:, 0])
+    )
     assert np.abs(held["means"] - opened.parameters["means"]).max() < 1e-5
     opacities = expit(opened.parameters["logit_opacities"])
     assert np.abs(expit(held["logit_opacities"]) - opacities).max() < 0.51 / 255
@@ -91,12 +101,19 @@ def test_in_a_browser_150000_splats_are_drawn_as_we_draw_them(written_by_gsply, 
 
 @pytest.mark.xdist_group("toy")
 def test_training_goes_on_from_a_splat_that_others_made(toy, tmp_path):
-    """It begins where the PLY is, not at the points, and as many Gaussians as it holds must be allowed."""
-    ply, inputs = toy["export"] / "scene.ply", {role: toy[of] for role, of in INPUTS["train"].items()}
+    """It begins where the PLY is, not at the points, and as many Gaussians as it holds must be
+    allowed.
+    """
+    ply, inputs = (
+        toy["export"] / "scene.ply",
+        {role: toy[of] for role, of in INPUTS["train"].items()},
+    )
     n = len(read_ply(ply)[0]["means"])
 
     def trained(name, **train):
-        settings = TOY["train"] | {"steps": 4, "report_every": 1, "densify": "off", "prune": False} | train
+        settings = (
+            TOY["train"] | {"steps": 4, "report_every": 1, "densify": "off", "prune": False} | train
+        )
         assert run_stage("train", tmp_path / name, inputs, TOY | {"train": settings}) == 0
         found = Gaussians.read(tmp_path / name)
         return found.notes["n_initial"], found.trace[0]["psnr"]
@@ -116,7 +133,9 @@ def test_a_splat_file_and_a_folder_of_3dgs_become_a_scene_and_a_page(tmp_path, n
     """Whose name says nothing of a PLY."""
     path = tmp_path / name
     if path.suffix:
-        row = np.array([(0, 0, 1, 0.1, 0.1, 0.1)], "<f4").tobytes() + bytes([9, 99, 200, 255, 255, 128, 128, 128])
+        row = np.array([(0, 0, 1, 0.1, 0.1, 0.1)], "<f4").tobytes() + bytes(
+            [9, 99, 200, 255, 255, 128, 128, 128]
+        )
         path.write_bytes(row * 9)
     else:
         (path / "point_cloud/iteration_7").mkdir(parents=True)
@@ -126,7 +145,11 @@ def test_a_splat_file_and_a_folder_of_3dgs_become_a_scene_and_a_page(tmp_path, n
         assert done.exit_code == 0, done.output
     assert len(Gaussians.read(tmp_path / "made/gaussians").parameters["means"]) == 9
     done = CliRunner().invoke(main, ["render", str(path), "--out", str(tmp_path / "frames")])
-    assert done.exit_code == 3 and "is a splat and no finished scene" in done.output and "chebsplat lift" in done.output
+    assert (
+        done.exit_code == 3
+        and "is a splat and no finished scene" in done.output
+        and ("chebsplat lift") in done.output
+    )
 
 
 def test_a_key_holds_what_training_starts_from_and_not_where_that_lies(tmp_path, quick_plans):

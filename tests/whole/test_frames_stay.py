@@ -1,4 +1,6 @@
-"""Every export lies in the frame and units of the poses that were given, however large, far off and tilted they are."""
+"""Every export lies in the frame and units of the poses that were given, however large, far off and
+tilted they are.
+"""
 
 from copy import deepcopy
 
@@ -25,20 +27,28 @@ TURN *= np.linalg.det(TURN)  # a rotation
 
 @pytest.fixture(scope="module")
 def moved(mixed, tmp_path_factory):
-    """A checkpoint with every SH degree whose poses are of another model of COLMAP's; means [N, 3]; its export."""
+    """A checkpoint with every SH degree whose poses are of another model of COLMAP's; means [N, 3];
+    its export.
+    """
     root, checkpoint = tmp_path_factory.mktemp("frames"), deepcopy(mixed[0])
     checkpoint.parameters.pop("features", None)
     means = SCALE * checkpoint.parameters["means"].astype(np.float64) @ TURN.T + SHIFT
     checkpoint.parameters["means"] = means.astype(np.float32)
-    checkpoint.parameters["log_scales"] = checkpoint.parameters["log_scales"] + np.float32(np.log(SCALE))
-    turned = Rotation.from_matrix(TURN) * Rotation.from_quat(checkpoint.parameters["quats"], scalar_first=True)
+    checkpoint.parameters["log_scales"] = checkpoint.parameters["log_scales"] + np.float32(
+        np.log(SCALE)
+    )
+    turned = Rotation.from_matrix(TURN) * Rotation.from_quat(
+        checkpoint.parameters["quats"], scalar_first=True
+    )
     checkpoint.parameters["quats"] = turned.as_quat(scalar_first=True).astype(np.float32)
     checkpoint.modules, checkpoint.optimizer = {}, {}
     poses = checkpoint.cameras.cam_from_world
     poses[:, :3, 3] = SCALE * poses[:, :3, 3] - poses[:, :3, :3] @ TURN.T @ SHIFT
     poses[:, :3, :3] = poses[:, :3, :3] @ TURN.T
     gaussians = published(root / "gaussians", checkpoint)
-    return checkpoint, chebsplat.run_stage("export", root / "scene/export", {"gaussians": gaussians})
+    return checkpoint, chebsplat.run_stage(
+        "export", root / "scene/export", {"gaussians": gaussians}
+    )
 
 
 def run(*arguments):
@@ -82,8 +92,11 @@ def test_parts_pages_and_cameras_lie_there_too(moved, tmp_path):
         run(command, export, "--out", tmp_path / out)
     close(read_ply(tmp_path / "part.ply")[0]["means"], wanted, 0)
     about, arrays = held_in(tmp_path / "page.html")
-    held = unpack(Packed({name: arrays[name] for name in arrays if name != "views"}, about["ranges"]))
-    close(held["means"], wanted, 1e-4)  # of extents of about 20: 24 bits a coordinate, then float32 at 120
+    held = unpack(
+        Packed({name: arrays[name] for name in arrays if name != "views"}, about["ranges"])
+    )
+    # of extents of about 20: 24 bits a coordinate, then float32 at 120
+    close(held["means"], wanted, 1e-4)
     rows = (tmp_path / "cameras/sparse/0/images.txt").read_text().splitlines()[1::2]
     shift = np.array([float(text) for text in rows[0].split()[5:8]])
     np.testing.assert_allclose(shift, checkpoint.cameras.cam_from_world[0, :3, 3], rtol=1e-12)
@@ -103,24 +116,46 @@ def test_an_imported_splat_stays_where_it_was(moved, tmp_path):
     run("page", theirs, "--out", tmp_path / "page.html")
     run("lift", "--out", tmp_path / "again", export / "scene.ply")
     refused(2, "exists", "lift", export / "scene.ply", "--out", theirs)
-    refused(2, "add --capture", "lift", export / "scene.ply", "--teacher", "x.onnx", "--out", tmp_path / "x")
+    refused(
+        2,
+        "add --capture",
+        "lift",
+        export / "scene.ply",
+        "--teacher",
+        "x.onnx",
+        "--out",
+        tmp_path / "x",
+    )
 
 
 def test_a_mesh_lies_there_too(mixed, moved, tmp_path):
-    """That of the moved scene, moved back, is that of the scene: voxels lie elsewhere, surfaces where they were."""
+    """That of the moved scene, moved back, is that of the scene: voxels lie elsewhere, surfaces
+    where they were.
+    """
     voxel, found = 0.04, []
     for scene, edge in ((mixed[1], voxel), (moved[1], SCALE * voxel)):
         out = tmp_path / f"{len(found)}.ply"
         run("mesh", scene, "--out", out, "--voxel", edge, "--raw")
         vertex = PlyData.read(out)["vertex"]
         found.append(np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float64))
-    refused(4, "shows no surface", "mesh", mixed[1], "--out", tmp_path / "a.glb", "--voxel", 1e6, "--raw")
+    refused(
+        4,
+        "shows no surface",
+        "mesh",
+        mixed[1],
+        "--out",
+        tmp_path / "a.glb",
+        "--voxel",
+        1e6,
+        "--raw",
+    )
     refused(2, ".ply or .glb", "mesh", mixed[1], "--out", tmp_path / "a.obj")
     refused(2, "exists", "mesh", mixed[1], "--out", out)
     back = (found[1] - SHIFT) @ TURN / SCALE
     for a, b in ((found[0], back), (back, found[0])):
         assert len(a) > 500
-        assert np.median(cKDTree(b).query(a)[0]) < 0.75 * voxel  # vertices of either are about a voxel apart
+        # vertices of either are about a voxel apart
+        assert np.median(cKDTree(b).query(a)[0]) < 0.75 * voxel
 
 
 @pytest.mark.slow

@@ -17,7 +17,9 @@ def trainer_on(up_to_teacher):
 
     def make(device, **settings):
         chosen = configs.build({"train": SETTINGS | settings}, "toy")
-        return trainer_from(up_to_teacher, chosen, "auto" if device == "cuda" else "reference", device=device)
+        return trainer_from(
+            up_to_teacher, chosen, "auto" if device == "cuda" else "reference", device=device
+        )
 
     return make
 
@@ -27,9 +29,14 @@ def test_gradients_of_a_first_step_are_those_in_plain_torch(trainer_on):
     for device, gradients in (("cuda", found), ("cpu", wanted)):
         made = trainer_on(device, steps=10)
         next(made.steps())
-        gradients |= {name: value.grad.cpu() for name, value in made.model.raw.items() if value.grad is not None}
+        gradients |= {
+            name: value.grad.cpu()
+            for name, value in made.model.raw.items()
+            if value.grad is not None
+        }
     assert found.keys() == wanted.keys()
-    for name, expected in wanted.items():  # gsplat's exponential is approximate, its covariances are float32
+    # gsplat's exponential is approximate, its covariances are float32
+    for name, expected in wanted.items():
         assert (found[name] - expected).norm() < 1e-3 * expected.norm(), name
 
 
@@ -46,8 +53,12 @@ def test_a_recorded_step_has_the_gradients_of_a_plain_one(trainer_on):
             made.optimizer.zero_grad(set_to_none=True)
             loss = made.losses_of(index, made.share)[1]["loss"]
             loss.backward()
-            found.append({name: value.grad.clone() for name, value in made.model.raw.items()} | {"loss": loss.detach()})
-        for name, wanted in found[1].items():  # gsplat adds gradients up in the order in which threads arrive
+            found.append(
+                {name: value.grad.clone() for name, value in made.model.raw.items()}
+                | {"loss": loss.detach()}
+            )
+        # gsplat adds gradients up in the order in which threads arrive
+        for name, wanted in found[1].items():
             assert (found[0][name] - wanted).norm() <= 1e-4 * wanted.norm(), name
 
 
@@ -62,8 +73,12 @@ def test_two_hundred_steps_reach_the_same_psnr(trainer_on):
 
 
 def test_growth_pruning_freeze_and_finish_run(trainer_on):
-    made = trainer_on("cuda", steps=60, densify="mixed", densify_from=0.1, densify_until=0.6, grow_threshold=1e-6)
+    made = trainer_on(
+        "cuda", steps=60, densify="mixed", densify_from=0.1, densify_until=0.6, grow_threshold=1e-6
+    )
     for _ in made.steps():
         pass
     assert made.population.n_added > 0
-    assert all(torch.from_numpy(value.astype("f4")).isfinite().all() for value in made.finish().values())
+    assert all(
+        torch.from_numpy(value.astype("f4")).isfinite().all() for value in made.finish().values()
+    )

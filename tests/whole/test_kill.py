@@ -1,4 +1,6 @@
-"""Killed at any moment, a run leaves nothing half made that looks whole, and the next one finishes."""
+"""Killed at any moment, a run leaves nothing half made that looks whole, and the next one
+finishes.
+"""
 
 import json
 import random
@@ -20,7 +22,10 @@ def test_kills_and_stops_leave_nothing_half_or_behind_and_a_rerun_gives_the_same
     assert len(blows) == 12 and finished
 
 
-TRAIN = "import chebsplat.stages.training.saves as r; r.SECONDS = 0.0; from chebsplat.pipelines.cli import main; main()"
+TRAIN = (
+    "import chebsplat.stages.training.saves as r; r.SECONDS = 0.0; from "
+    "chebsplat.pipelines.cli import main; main()"
+)
 
 
 @pytest.mark.slow

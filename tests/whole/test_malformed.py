@@ -1,4 +1,6 @@
-"""Malformed inputs end in a clear error: no traceback, the documented exit code, the file or setting by name."""
+"""Malformed inputs end in a clear error: no traceback, the documented exit code, the file or
+setting by name.
+"""
 
 import json
 import shutil

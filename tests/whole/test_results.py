@@ -46,10 +46,13 @@ def sections(page):
 
 
 def test_the_digest_in_docs_is_that_of_every_default_and_rule():
-    """Where this fails, a default has changed: figures of the one before move under "Earlier recipes", unless
-    they are as they were; commit, date and digest follow.
+    """Where this fails, a default has changed: figures of the one before move under "Earlier
+    recipes", unless they are as they were; commit, date and digest follow.
     """
-    held = Config().model_dump(mode="json"), {name: default.by for name, default in DEFAULTS.items()}
+    held = (
+        Config().model_dump(mode="json"),
+        {name: default.by for name, default in DEFAULTS.items()},
+    )
     digest = hashlib.sha256(json.dumps(held, sort_keys=True).encode()).hexdigest()[:12]
     assert recipe()[2] == digest
 
@@ -59,7 +62,9 @@ def test_figures_outside_earlier_recipes_are_not_older_than_the_default(page):
     changed, since, _ = recipe()
     for title, text in sections(page):
         made = re.findall(f"Made at {AT}", text)
-        assert made or not FIGURE.search(text), f"{title}: say by which commit its figures were made"
+        assert made or not FIGURE.search(text), (
+            f"{title}: say by which commit its figures were made"
+        )
         for commit, date in made:
             assert date >= since, title
             if known(commit) and known(changed):

@@ -8,7 +8,8 @@ from functools import partial
 import pytest
 from shared import ROOT
 
-# What `python3.11` and .venv/bin/python do here: a venv that says where it was made, and nothing else; no downloads.
+# What `python3.11` and .venv/bin/python do here: a venv that says where it was made, and nothing
+# else; no downloads.
 PYTHON = """#!/bin/bash
 here=$(pwd -P)
 [ -z "$CALLS" ] || echo "$*" >> "$CALLS"
@@ -53,7 +54,13 @@ def make(folder, *targets):
 
 
 def made_in(folder):
-    return (folder / ".venv/bin/chebsplat").read_text().strip().removeprefix("#!").removesuffix("/.venv/bin/python")
+    return (
+        (folder / ".venv/bin/chebsplat")
+        .read_text()
+        .strip()
+        .removeprefix("#!")
+        .removesuffix("/.venv/bin/python")
+    )
 
 
 def test_setting_up_twice_does_nothing_the_second_time(clone):
@@ -61,7 +68,9 @@ def test_setting_up_twice_does_nothing_the_second_time(clone):
     assert make(clone, "setup") == ""
 
 
-@pytest.mark.parametrize("change", [os.rename, partial(shutil.copytree, symlinks=True)], ids=["renamed", "copied"])
+@pytest.mark.parametrize(
+    "change", [os.rename, partial(shutil.copytree, symlinks=True)], ids=["renamed", "copied"]
+)
 def test_a_renamed_or_copied_clone_makes_its_venv_anew(clone, change):
     make(clone, "setup")
     assert made_in(clone) == str(clone)
@@ -74,7 +83,8 @@ def test_a_renamed_or_copied_clone_makes_its_venv_anew(clone, change):
 
 def test_a_venv_of_another_making_is_left_alone(clone):
     make(clone, "setup")
-    (clone / ".venv/pyvenv.cfg").write_text("home = /usr/bin\nuv = 0.13\n")  # does not say where it was made
+    # does not say where it was made
+    (clone / ".venv/pyvenv.cfg").write_text("home = /usr/bin\nuv = 0.13\n")
     assert make(clone, "setup") == ""
     shared = clone.with_name("shared")
     os.rename(clone / ".venv", shared)
@@ -84,12 +94,18 @@ def test_a_venv_of_another_making_is_left_alone(clone):
 
 
 def python(clone, name, tag, pip="", venv=True):
-    """A Python `name` of version `tag` beside the others on the PATH; `pip`: where its pip looks for wheels."""
+    """A Python `name` of version `tag` beside the others on the PATH; `pip`: where its pip looks
+    for wheels.
+    """
     file = clone.parent / "bin" / name
     lines = f"#!/bin/bash\nexport TAG={tag} NO_VENV={int(not venv)}\n"
     if pip:
         lines += f'[[ "$*" == *find-links* ]] && echo "{pip}" && exit\n'
-    file.write_text(PYTHON.replace("#!/bin/bash\n", lines + f'[ "$1" = --version ] && echo "Python {tag}" && exit\n'))
+    file.write_text(
+        PYTHON.replace(
+            "#!/bin/bash\n", lines + f'[ "$1" = --version ] && echo "Python {tag}" && exit\n'
+        )
+    )
     file.chmod(0o755)
 
 
@@ -104,7 +120,12 @@ def test_the_newest_supported_python_that_can_make_a_venv_is_taken(clone):
 
 def test_a_torch_that_pip_finds_in_a_folder_decides_for_the_python_it_is_built_for(clone, tmp_path):
     (tmp_path / "torch-2.13.0+cpu-cp311-cp311-linux_x86_64.whl").touch()
-    for name, tag in (("python3.13", 313), ("python3.12", 312), ("python3.11", 311), ("python3", 313)):
+    for name, tag in (
+        ("python3.13", 313),
+        ("python3.12", 312),
+        ("python3.11", 311),
+        ("python3", 313),
+    ):
         python(clone, name, tag, pip=tmp_path)
     done = run(clone, "bash", "pipelines/setup.sh")
     assert "making .venv with Python 311" in done.stderr
@@ -155,12 +176,20 @@ def test_device_cuda_is_refused_where_there_is_no_driver(clone):
     assert "none of auto, cpu, cuda" in installing(clone, "device=tpu")[0].stderr
 
 
-STUB = '#!/bin/bash\nprintf \'%s\\0\' "$@" > "$CALLS"\n'  # of whatever make calls: keeps what it is given
-HOSTILE = ["Anna's room", 'a "b" room', "$5 $(shell touch x) $$ `touch x`", "'; touch x; '", '"; touch x; "',
+# of whatever make calls: keeps what it is given
+STUB = '#!/bin/bash\nprintf \'%s\\0\' "$@" > "$CALLS"\n'
+HOSTILE = ["Anna's room", 'a "b" room', "$5 $(shell touch x) $$ `touch x`", "'; touch x; '", '"; touch x; '
+                                                                                             ''
+                                                                                             ''
+                                                                                             '"',
            "a\nb", " # two  spaces \\", "-x;touch x", "*", "$(error no) ${HOME}", "été %s"]  # fmt: skip
 CALLED = [  # goals, variables that get the name, what the command gets of it
     ([], ["scene", "set", "stage"], ["run", "--scene={}", "--set={}", "--stage={}"]),
-    ([], ["sequence", "quality", "ablation"], ["run", "--sequence={}", "--quality={}", "--ablation={}"]),
+    (
+        [],
+        ["sequence", "quality", "ablation"],
+        ["run", "--sequence={}", "--quality={}", "--ablation={}"],
+    ),
     ([], ["scene", "knowledge"], ["run", "--scene={}", "--knowledge={}"]),
     (["plan"], ["scene"], ["plan", "--scene={}", "--device=cpu"]),
     (["plan"], ["study"], ["study", "--plan", "--device=cpu", "--", "{}"]),
@@ -197,7 +226,8 @@ def test_names_reach_the_command_as_they_are_whatever_they_hold(stubbed):
         for name in HOSTILE:
             given = dict.fromkeys(variables, name)
             device = ["device=cpu"] if "--device=cpu" in wanted else []
-            text = [word.replace("{}", name.lstrip()) for word in wanted]  # make takes a leading space for its own
+            # make takes a leading space for its own
+            text = [word.replace("{}", name.lstrip()) for word in wanted]
             assert called(stubbed, *goals, *device, *(f"{k}={v}" for k, v in given.items())) == text
     text = [word.replace("{}", HOSTILE[2]) for word in CALLED[0][2]]
     assert called(stubbed, **dict.fromkeys(CALLED[0][1], HOSTILE[2])) == text  # by the environment
@@ -205,5 +235,11 @@ def test_names_reach_the_command_as_they_are_whatever_they_hold(stubbed):
 
 
 def test_arguments_are_words_of_the_shell_and_none_of_make(stubbed):
-    words = called(stubbed, "view", "scene=a", "args=--words 'my words.txt' --against \"$NAME\"", NAME="two words")
+    words = called(
+        stubbed,
+        "view",
+        "scene=a",
+        "args=--words 'my words.txt' --against \"$NAME\"",
+        NAME="two words",
+    )
     assert words == ["view", "--words", "my words.txt", "--against", "two words", "--", "a"]

@@ -33,7 +33,9 @@ REGIONS = {"n_regions": 24, "region_size": 8}
 
 @pytest.fixture
 def gpu(monkeypatch):
-    """A simulated GPU, on which gsplat's stand-in renders; "cuda" is a device while `gpu.active()`."""
+    """A simulated GPU, on which gsplat's stand-in renders; "cuda" is a device while
+    `gpu.active()`.
+    """
     simulated = SimulatedGpu()
     monkeypatch.setitem(sys.modules, "gsplat", stand_in_gsplat)
     monkeypatch.setattr(stand_in_gsplat, "within", [simulated.uncounted])
@@ -48,7 +50,9 @@ def trainer_on(up_to_teacher):
 
     def make(device, **settings):
         chosen = configs.build({"train": WHOLE | settings, "describe": REGIONS}, "toy")
-        return trainer_from(up_to_teacher, chosen, "auto" if device == "cuda" else "reference", device=device)
+        return trainer_from(
+            up_to_teacher, chosen, "auto" if device == "cuda" else "reference", device=device
+        )
 
     return make
 
@@ -58,8 +62,18 @@ def test_the_simulation_has_the_rules_of_torch(gpu):
     with gpu.active():
         b = a.to("cuda")
         assert (a.device.type, b.device, (b * 2 + a[0]).device) == ("cpu", GPU, GPU)
-        assert torch.zeros(3, device=b.device).device == b.new_zeros(2).device == b[b > 1].device == GPU
-        for mixed in (lambda: a + b, lambda: torch.stack([a[0], b[0]]), lambda: a.add_(b), lambda: b @ a):
+        assert (
+            torch.zeros(3, device=b.device).device
+            == b.new_zeros(2).device
+            == b[b > 1].device
+            == GPU
+        )
+        for mixed in (
+            lambda: a + b,
+            lambda: torch.stack([a[0], b[0]]),
+            lambda: a.add_(b),
+            lambda: b @ a,
+        ):
             with pytest.raises(RuntimeError, match="mixes devices"):
                 mixed()
         with pytest.raises(TypeError, match="copy it to the CPU"):
@@ -94,26 +108,40 @@ def test_growth_pruning_refresh_freeze_and_finish_mix_no_devices(settings, gpu, 
             pass
         assert made.population.n_added > 0 and "sh_logits" not in made.model.raw
         assert {value.device for value in made.model.raw.values()} == {GPU}
-        assert {p.device for module in made.model.modules.values() for p in module.parameters()} <= {GPU}
+        assert {
+            p.device for module in made.model.modules.values() for p in module.parameters()
+        } <= {GPU}
         parameters = made.finish()
-    assert all(isinstance(value, np.ndarray) and np.isfinite(value).all() for value in parameters.values())
+    assert all(
+        isinstance(value, np.ndarray) and np.isfinite(value).all() for value in parameters.values()
+    )
     assert len(parameters["means"]) != n
 
 
 def test_a_step_moves_no_array_of_gaussians_and_reads_figures_every_tenth_time(gpu, trainer_on):
-    settings = {"densify": "off", "refresh_every": 1000, "remove_every": 1000, "report_every": 1000, "sh_freeze": 1.0}
+    settings = {
+        "densify": "off",
+        "refresh_every": 1000,
+        "remove_every": 1000,
+        "report_every": 1000,
+        "sh_freeze": 1.0,
+    }
     largest, n_read = 0, 0
     with gpu.active():
         made = trainer_on("cuda", **settings)
         gpu.moved.clear()
         for _ in made.steps():
-            moved = [one for one in gpu.moved if "_refuse_broken" not in one.what]  # that is the stand-in's
+            # that is the stand-in's
+            moved = [one for one in gpu.moved if "_refuse_broken" not in one.what]
             gpu.moved.clear()
             frozen = made.step == WHOLE["steps"]
-            if frozen or [one for one in moved if "region_guidance" in one.what]:  # once after a refresh
+            # once after a refresh
+            if frozen or [one for one in moved if "region_guidance" in one.what]:
                 continue
             down = [one for one in moved if one.kind == "down"]
-            assert [len(one.shape) for one in down] == ([1] if made.step % READ_EVERY == 0 else []), down
+            assert [len(one.shape) for one in down] == (
+                [1] if made.step % READ_EVERY == 0 else []
+            ), down
             n_read += len(down) > 0
             assert not [one for one in moved if one.kind == "wait"]
             up = [one.shape for one in moved if one.kind == "up"]
@@ -125,16 +153,26 @@ def test_a_step_moves_no_array_of_gaussians_and_reads_figures_every_tenth_time(g
 
 
 def test_a_step_launches_at_most_60_operations_beside_those_of_gsplat(gpu, trainer_on):
-    settings = {"densify": "off", "refresh_every": 1000, "remove_every": 1000, "report_every": 1000, "sh_freeze": 1.0}
+    settings = {
+        "densify": "off",
+        "refresh_every": 1000,
+        "remove_every": 1000,
+        "report_every": 1000,
+        "sh_freeze": 1.0,
+    }
     counts = {}
     with gpu.active():
         made = trainer_on("cuda", **settings)
         for _ in made.steps():
-            recorded = [recording.graph is not None for recording in made.model.replay.recordings.values()]
+            recorded = [
+                recording.graph is not None for recording in made.model.replay.recordings.values()
+            ]
             counts[made.step] = gpu.launches, (len(recorded), sum(recorded))
             gpu.launches = 0
     assert made.model.raw["features"].shape[1] >= 3 and "sh_logits" in made.model.raw
-    replayed = [n for step, (n, recorded) in counts.items() if recorded == counts.get(step - 1, (0, 0))[1]]
+    replayed = [
+        n for step, (n, recorded) in counts.items() if recorded == counts.get(step - 1, (0, 0))[1]
+    ]
     assert len(replayed) > WHOLE["steps"] / 2 and 10 < max(replayed) <= 60, counts
 
 
@@ -170,7 +208,9 @@ def test_the_stage_trains_there(gpu, up_to_teacher, tmp_path, caplog):
     inputs = {role: up_to_teacher / of for role, of in folders}
     sections = {"train": WHOLE, "describe": REGIONS}
     (tmp_path / "out").mkdir()
-    job = Job(inputs, configs.build(sections, "toy"), tmp_path / "out", tmp_path / "scratch", "cuda")
+    job = Job(
+        inputs, configs.build(sections, "toy"), tmp_path / "out", tmp_path / "scratch", "cuda"
+    )
     with gpu.active():
         train.run(job)
     assert "peak_device_bytes" in job.facts and job.facts["steps"] == 40
@@ -182,15 +222,22 @@ def test_the_cuda_backend_renders_as_the_others_through_what_gsplat_is_asked(cha
     arguments, options = scene(channels=channels), {"rasterize_mode": mode, "absgrad": True}
     backgrounds = torch.full((2, channels), 0.7)
     weights = torch.randn(2, 37, 53, channels, generator=torch.Generator().manual_seed(1))
-    wanted = gradients(arguments, torch.float32, "reference", weights, backgrounds=backgrounds, **options)
+    wanted = gradients(
+        arguments, torch.float32, "reference", weights, backgrounds=backgrounds, **options
+    )
     with gpu.active():
         there = backgrounds.to("cuda")
-        found = gradients(arguments, torch.float32, "auto", weights, device="cuda", backgrounds=there, **options)
+        found = gradients(
+            arguments, torch.float32, "auto", weights, device="cuda", backgrounds=there, **options
+        )
         images = [value.cpu() for value in found[:2]]
         slopes = [value.cpu() for value in [*found[2], found[3]["means2d"].absgrad]]
         assert found[3]["radii"].shape == (2, 150)
-    for a, b in zip([*images, *slopes], [*wanted[:2], *wanted[2], wanted[3]["means2d"].absgrad], strict=True):
-        assert (a - b).norm() <= 1e-6 * b.norm()  # the same operations, but on quaternions of another length
+    for a, b in zip(
+        [*images, *slopes], [*wanted[:2], *wanted[2], wanted[3]["means2d"].absgrad], strict=True
+    ):
+        # the same operations, but on quaternions of another length
+        assert (a - b).norm() <= 1e-6 * b.norm()
 
 
 def test_an_opacity_above_the_ceiling_is_as_opaque_in_the_middle_and_keeps_its_gradient(gpu):
@@ -201,7 +248,9 @@ def test_an_opacity_above_the_ceiling_is_as_opaque_in_the_middle_and_keeps_its_g
     for backend, device in (("reference", "cpu"), ("auto", "cuda")):
         with gpu.active():
             given = [value.to(device, copy=True).requires_grad_() for value in arguments]
-            alpha = rasterize(*given, viewmats.to(device), Ks.to(device), width, height, backend=backend)[1]
+            alpha = rasterize(
+                *given, viewmats.to(device), Ks.to(device), width, height, backend=backend
+            )[1]
             alpha.sum().backward()
             assert given[3].grad.item() > 0
             alphas.append(alpha.detach().cpu()[0, ..., 0])
@@ -223,13 +272,20 @@ def test_a_finished_scene_renders_there_as_on_the_cpu(gpu):
     means, quats, scales, opacities, _ = (value.numpy() for value in scene())
     parameters = {"means": means, "quats": quats, "log_scales": np.log(scales)}
     parameters["logit_opacities"] = np.zeros_like(opacities)
-    parameters |= {"sh0": rng.normal(size=(150, 1, 3)).astype(np.float32), "features": np.ones((150, 4), np.float32)}
-    degrees, band = np.sort(rng.integers(0, 4, 150)), np.repeat([1, 2, 3], [3, 5, 7])  # nothing is above a degree
+    parameters |= {
+        "sh0": rng.normal(size=(150, 1, 3)).astype(np.float32),
+        "features": np.ones((150, 4), np.float32),
+    }
+    # nothing is above a degree
+    degrees, band = np.sort(rng.integers(0, 4, 150)), np.repeat([1, 2, 3], [3, 5, 7])
     shN = rng.normal(size=(150, 15, 3)) * (band <= degrees[:, None])[..., None]
     parameters |= {"shN": shN.astype(np.float32), "degrees": degrees}
     viewmats, Ks, width, height = camera()
     view = View(Ks[0], viewmats[0], width, height)
-    wanted, depth = SceneRenderer(parameters).render(view, True), SceneRenderer(parameters).render_depth(view)
+    wanted, depth = (
+        SceneRenderer(parameters).render(view, True),
+        SceneRenderer(parameters).render_depth(view),
+    )
     with gpu.active():
         empty = SceneRenderer({name: values[:0] for name, values in parameters.items()}, "cuda")
         assert not empty.render(view)[0].any()
@@ -253,8 +309,14 @@ def test_a_scene_is_evaluated_there_as_on_the_cpu(gpu, toy, tmp_path):
         made[device] = json.loads((out / "figures.json").read_text())
     found, wanted = made["cuda"], made["cpu"]
     assert found["image"]["psnr"] == pytest.approx(wanted["image"]["psnr"], abs=0.05)
-    assert found["segmentation"]["scene"]["miou"] == pytest.approx(wanted["segmentation"]["scene"]["miou"], abs=0.01)
-    assert found["frames_per_second"] and "by part" in str(found["left_out"]) and not found["milliseconds"]
+    assert found["segmentation"]["scene"]["miou"] == pytest.approx(
+        wanted["segmentation"]["scene"]["miou"], abs=0.01
+    )
+    assert (
+        found["frames_per_second"]
+        and "by part" in str(found["left_out"])
+        and not found["milliseconds"]
+    )
 
 
 def test_plain_torch_on_a_gpu_renders_each_view_anew(gpu, trainer_on, up_to_teacher):
@@ -264,5 +326,8 @@ def test_plain_torch_on_a_gpu_renders_each_view_anew(gpu, trainer_on, up_to_teac
         made = trainer_from(up_to_teacher, chosen, "reference", device="cuda")
         for index in (0, 0, 5, 9):
             views = made.views.camera(index, 1), plain.views.camera(index, 1)
-            found, wanted = (one.model.render(view, 0).rgb for one, view in zip((made, plain), views, strict=True))
+            found, wanted = (
+                one.model.render(view, 0).rgb
+                for one, view in zip((made, plain), views, strict=True)
+            )
             torch.testing.assert_close(found.detach().cpu(), wanted.detach())

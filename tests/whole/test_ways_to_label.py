@@ -1,4 +1,6 @@
-"""One scene's labels written in many ways: its mIoU is what they are worth, or a line names what was in the way."""
+"""One scene's labels written in many ways: its mIoU is what they are worth, or a line names what
+was in the way.
+"""
 
 import json
 import logging
@@ -26,7 +28,9 @@ __all__ = ["scene"]  # the fixture
 
 @pytest.fixture(scope="module")
 def made(scene, tmp_path_factory):
-    """A scene that was trained from labels by name, and what it says of the test views, names [2, H, W]."""
+    """A scene that was trained from labels by name, and what it says of the test views, names [2,
+    H, W].
+    """
     folder = tmp_path_factory.mktemp("made")
     write(folder / "scene", scene, pictures(IDS))
     inputs = {}
@@ -34,10 +38,21 @@ def made(scene, tmp_path_factory):
         "ingest": (), "sfm": ("capture",), "teacher": ("capture",), "train": ("capture", "points", "features"),
         "export": ("gaussians", "features"), "evaluate": ("capture", "scene", "features"),
     }  # fmt: skip
-    of = {"capture": "ingest", "points": "sfm", "features": "teacher", "gaussians": "train", "scene": "export"}
+    of = {
+        "capture": "ingest",
+        "points": "sfm",
+        "features": "teacher",
+        "gaussians": "train",
+        "scene": "export",
+    }
     for stage, roles in given.items():
         inputs[stage] = folder / stage
-        assert run_stage(stage, inputs[stage], {role: inputs[of[role]] for role in roles}, config(folder)) == 0
+        assert (
+            run_stage(
+                stage, inputs[stage], {role: inputs[of[role]] for role in roles}, config(folder)
+            )
+            == 0
+        )
     found = Evaluation.read(inputs["evaluate"])
     classes = found.figures["segmentation"]["classes"]
     said = np.array([*classes, None], object)[found.pictures["predicted"][:]]
@@ -51,14 +66,18 @@ def config(folder):
 
 
 def truth_of(scene, lost, views):
-    """Names of the test views' classes [2, H, W], None where there are none, of lost classes, and in other views."""
+    """Names of the test views' classes [2, H, W], None where there are none, of lost classes, and
+    in other views.
+    """
     names = np.array([*(None if name in lost else name for name in NAMES), None], object)
-    return np.stack([names[scene["labels"][k] if k in views else np.full((72, 96), -1)] for k in (0, 8)])
+    return np.stack(
+        [names[scene["labels"][k] if k in views else np.full((72, 96), -1)] for k in (0, 8)]
+    )
 
 
 def miou(said, truth, lost):
-    """Oracle: mean over names of |both| / |either| of their pixels where there is a truth, in per cent; of no class
-    None.
+    """Oracle: mean over names of |both| / |either| of their pixels where there is a truth, in per
+    cent; of no class None.
     """
     known = truth != None  # noqa: E711
     pairs = [((said == name) & known, truth == name) for name in NAMES if name not in lost]
@@ -75,7 +94,9 @@ SCORES = 0.1 + np.eye(len(NAMES) + 1, len(NAMES))
 
 
 def write(folder, scene, of_map, names=None, place="semantic", views=range(16), half=False):
-    """A COLMAP source whose maps `of_map` writes; names by id, or all from 1; "": no labels.json."""
+    """A COLMAP source whose maps `of_map` writes; names by id, or all from 1; "": no
+    labels.json.
+    """
     colmap(folder, scene, depth=lambda z: 1000 * z)
     (folder / place).mkdir()
     for k in views:
@@ -94,8 +115,8 @@ def ids(**how):
 
 
 UNMATCHED = "no label of the scene is called like"
-# what: (how it is written, classes that do not count, a word of the line that names the cause where mIoU is another or
-# none)
+# what: (how it is written, classes that do not count, a word of the line that names the cause where
+# mIoU is another or none)
 WAYS = {
     "8 bits": (ids(), (), ""),
     "JPEG": ({"of_map": pictures(IDS, ending=".jpg", form="JPEG")}, (), "is a JPEG picture"),
@@ -111,24 +132,42 @@ WAYS = {
     "a class without a name": (ids(names=dict(list(enumerate(NAMES, 1))[1:])), (NAMES[0],), ""),
     "a class alone": (ids(names={1: NAMES[0]}), NAMES[1:], "one class alone"),
     "background of id 0": (ids(names=renamed(str) | {0: "background"}), (), ""),
-    "from 0 with 255, with names": ({"of_map": pictures(ZERO), "names": dict(enumerate(NAMES))}, (), ""),
+    "from 0 with 255, with names": (
+        {"of_map": pictures(ZERO), "names": dict(enumerate(NAMES))},
+        (),
+        "",
+    ),
     "from 0 with 255, without names": ({"of_map": pictures(ZERO), "names": ""}, (), UNMATCHED),
     "ids without names": (ids(names=""), (), "have no names"),
     "colours": ({"of_map": pictures(COLORS), "names": HEX}, (), ""),
-    "colours without names": ({"of_map": pictures(COLORS), "names": ""}, (), "colours without names"),
-    "scores": ({"of_map": arrays(SCORES, np.float32, (2, 0, 1)), "names": dict(enumerate(NAMES))}, (), ""),
+    "colours without names": (
+        {"of_map": pictures(COLORS), "names": ""},
+        (),
+        "colours without names",
+    ),
+    "scores": (
+        {"of_map": arrays(SCORES, np.float32, (2, 0, 1)), "names": dict(enumerate(NAMES))},
+        (),
+        "",
+    ),
     "masks": ({"of_map": masks(NAMES), "names": ""}, (), ""),
     "test views alone": (ids(views=(0, 8)), (), ""),
     "one test view": (ids(views=range(8)), (), ""),
     "no test view": (ids(views=range(1, 8)), (), "no pixel of the evaluated views"),
-    "ids by name": (ids(names={name: k for k, name in enumerate(NAMES, 1)}), (), "id is not usable"),
+    "ids by name": (
+        ids(names={name: k for k, name in enumerate(NAMES, 1)}),
+        (),
+        "id is not usable",
+    ),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("ways to label")
 @pytest.mark.parametrize("way", WAYS)
-def test_a_way_to_write_labels_is_worth_what_they_are_or_a_line_says_why(scene, made, tmp_path, caplog, capfd, way):
+def test_a_way_to_write_labels_is_worth_what_they_are_or_a_line_says_why(
+    scene, made, tmp_path, caplog, capfd, way
+):
     (how, lost, word), (exported, said) = WAYS[way], made
     worth = miou(said, truth_of(scene, lost, how.get("views", range(16))), lost)
     write(tmp_path / "scene", scene, **how)
@@ -138,11 +177,15 @@ def test_a_way_to_write_labels_is_worth_what_they_are_or_a_line_says_why(scene, 
             if run_stage("ingest", tmp_path / "ingest", {}, config(tmp_path)) == 0:
                 given = {"capture": tmp_path / "ingest", "scene": exported}
                 assert run_stage("evaluate", tmp_path / "evaluate", given, config(tmp_path)) == 0
-                found = Evaluation.read(tmp_path / "evaluate").figures["segmentation"]["scene"]["miou"]
+                found = Evaluation.read(tmp_path / "evaluate").figures["segmentation"]["scene"][
+                    "miou"
+                ]
         except ChebsplatError as refused:
             told = str(refused)
     told += caplog.text + capfd.readouterr().err
     found = None if found is None else 100 * found
     print(f"{way}: {found} of {worth} %")
     if found is None or worth is None or abs(found - worth) > POINTS:
-        assert word and re.search(word, told, re.IGNORECASE), f"{found} % of {worth}: {told[-2000:]}"
+        assert word and re.search(word, told, re.IGNORECASE), (
+            f"{found} % of {worth}: {told[-2000:]}"
+        )

@@ -1,4 +1,6 @@
-"""One segmenter brought in many ways: each says what the segmenter says, or a line names what was in the way."""
+"""One segmenter brought in many ways: each says what the segmenter says, or a line names what was
+in the way.
+"""
 
 import json
 
@@ -24,7 +26,9 @@ def capture(tmp_path_factory):
     """Four views of blocks in three colours, neither pure nor alike, and what they are."""
     rng = np.random.default_rng(0)
     labels = np.kron(rng.integers(0, 3, (4, 6, 8)), np.ones((1, 8, 8), np.int16)).astype(np.int16)
-    colors = np.array(list(COLORS.values()))[labels] * 60 + 127 + rng.normal(0, 20, (*labels.shape, 3))
+    colors = (
+        np.array(list(COLORS.values()))[labels] * 60 + 127 + rng.normal(0, 20, (*labels.shape, 3))
+    )
     record = Capture(
         [f"{k}.png" for k in range(4)], colors.clip(0, 255).astype(np.uint8), np.tile(np.eye(3), (4, 1, 1)), None,
         np.arange(4) == 0, labels=labels, class_names=list(COLORS),
@@ -33,8 +37,13 @@ def capture(tmp_path_factory):
 
 
 def segmenter(folder, wants, *end, shape=(1, 3, "H", "W"), **toml):
-    """A model of what it `wants` to be fed, and the TOML that says so; `end`: nodes after the logits."""
-    path, kernel = folder / "model.onnx", np.repeat(np.repeat(np.eye(3)[:, :, None, None], 4, 2), 4, 3) * 5 / 16
+    """A model of what it `wants` to be fed, and the TOML that says so; `end`: nodes after the
+    logits.
+    """
+    path, kernel = (
+        folder / "model.onnx",
+        np.repeat(np.repeat(np.eye(3)[:, :, None, None], 4, 2), 4, 3) * 5 / 16,
+    )
     turn = np.array([2, 1, 0] if wants.get("order") == "BGR" else [0, 1, 2])
     mean, std = (np.reshape(wants[key], (1, 3, 1, 1)) for key in ("mean", "std"))
     constants = {"kernel": kernel, "scale": 2 * std, "offset": 2 * mean - 1}
@@ -87,11 +96,17 @@ def channels_last_in(folder):
     model = onnx.load(path)
     entry = helper.make_tensor_value_info("photo", TensorProto.FLOAT, (1, "H", "W", 3))
     model.graph.input[0].CopyFrom(entry)
-    model.graph.node.insert(0, helper.make_node("Transpose", ["photo"], ["image"], perm=[0, 3, 1, 2]))
+    model.graph.node.insert(
+        0, helper.make_node("Transpose", ["photo"], ["image"], perm=[0, 3, 1, 2])
+    )
     onnx.save(model, path)
 
 
-SOFTMAX, HALF, FLOAT = node("Softmax", axis=1), node("Cast", to=TensorProto.FLOAT16), node("Cast", to=TensorProto.FLOAT)
+SOFTMAX, HALF, FLOAT = (
+    node("Softmax", axis=1),
+    node("Cast", to=TensorProto.FLOAT16),
+    node("Cast", to=TensorProto.FLOAT),
+)
 WAYS = {  # how it is brought, and a word of what is said, "" where nothing need be
     "logits": (lambda f: segmenter(f, SIGNED), ""),
     "colours of 0 to 1": (lambda f: segmenter(f, RAW), ""),
@@ -110,18 +125,26 @@ WAYS = {  # how it is brought, and a word of what is said, "" where nothing need
     "cosines": (lambda f: segmenter(f, SIGNED, node("LpNormalization", axis=1)), "values of cosines"),
     "no output in the TOML": (lambda f: segmenter(f, SIGNED, output=None), "has no `output`: logits"),
     "no map first": (lambda f: of_outputs(f, "flat", "features"), ": features is taken"),
-    "a map of other channels first": (lambda f: of_outputs(f, "twice", "features"), ": features is taken"),
+    "a map of other channels first": (lambda f: of_outputs(f, "twice", "features"), ": features is "
+                                                                                    "taken"),
     "two maps alike": (
         lambda f: of_outputs(f, "features", "same"), "same [1, 3, 12, 16]: more than one fits"
     ),
     "two maps alike, one named": (lambda f: of_outputs(f, "features", "same", tensor="same"), ""),
     "two maps alike, none of that name": (
-        lambda f: of_outputs(f, "features", "same", tensor="sane"), "no output is called sane: there are features [1, 3"
+        lambda f: of_outputs(f, "features", "same", tensor="sane"), "no output is called sane: there are features [1, "
+                                                                    ""
+                                                                    ""
+                                                                    "3"
     ),
     "no map that fits": (lambda f: of_outputs(f, "twice", "four"), "none fits"),
-    "channels last": (lambda f: segmenter(f, SIGNED, node("Transpose", perm=[0, 2, 3, 1])), "channels come last"),
+    "channels last": (lambda f: segmenter(f, SIGNED, node("Transpose", perm=[0, 2, 3, 1])), "channels come "
+                                                                                            ""
+                                                                                            ""
+                                                                                            "last"),
     "the likeliest class alone": (likeliest, "the likeliest class alone"),
-    "and as numbers": (lambda f: segmenter(f, SIGNED, node("ArgMax", axis=1), FLOAT), "names 3 classes"),
+    "and as numbers": (lambda f: segmenter(f, SIGNED, node("ArgMax", axis=1), FLOAT), "names 3 "
+                                                                                      "classes"),
     "channels last, of photos": (channels_last_in, "one image [1, 3, H, W] is needed"),
     "mean and std of 0 to 255": (
         lambda f: segmenter(f, IMAGENET, mean=[123.675, 116.28, 103.53], std=[58.395, 57.12, 57.375]),
@@ -144,11 +167,15 @@ WAYS = {  # how it is brought, and a word of what is said, "" where nothing need
 def miou(said, truth):
     """Of maps of the same size, in per cent."""
     unions = [((said == k) | (truth == k)).sum() for k in range(3)]
-    return 100 * np.mean([((said == k) & (truth == k)).sum() / union for k, union in enumerate(unions)])
+    return 100 * np.mean(
+        [((said == k) & (truth == k)).sum() / union for k, union in enumerate(unions)]
+    )
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_segmenter_says_the_same_however_it_is_brought_or_a_line_says_why_not(tmp_path, capture, capsys, way):
+def test_a_segmenter_says_the_same_however_it_is_brought_or_a_line_says_why_not(
+    tmp_path, capture, capsys, way
+):
     bring, word = WAYS[way]
     bring(tmp_path)
     config = {"teacher": {"model": str(tmp_path / "model.onnx")}}

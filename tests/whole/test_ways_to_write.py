@@ -1,4 +1,6 @@
-"""One scene written in many ways: each trains to what the scene is worth, or a line names what was in the way."""
+"""One scene written in many ways: each trains to what the scene is worth, or a line names what was
+in the way.
+"""
 
 import json
 import logging
@@ -26,7 +28,13 @@ DECIBELS = 1.0  # that a way to write a scene may cost without a word
 CONFIG = TOY | {
     "ingest": {"min_views": 2},
     "sfm": {"max_points": 3000, "dense": "off"},
-    "train": {"steps": 80, "semantics": False, "max_gaussians": 3500, "n_densify": 1, "report_every": 80},
+    "train": {
+        "steps": 80,
+        "semantics": False,
+        "max_gaussians": 3500,
+        "n_densify": 1,
+        "report_every": 80,
+    },
 }
 FLIP = np.array([1.0, -1.0, -1.0, 1.0])
 AS_IT_IS = 1.0, np.eye(3), np.zeros(3)
@@ -35,7 +43,9 @@ TURNED = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
 
 @pytest.fixture(scope="module")
 def scene():
-    """A toy room of 16 views of 96 x 72, and 3,000 points of its surface with colours and who sees them [T, 2]."""
+    """A toy room of 16 views of 96 x 72, and 3,000 points of its surface with colours and who sees
+    them [T, 2].
+    """
     fields, rng = generated.capture("toy", 1, "toy"), np.random.default_rng(0)
     poses, Ks, depth = fields["cam_from_world"], fields["Ks"], fields["depth"]
     points, colors = [], []
@@ -60,7 +70,9 @@ def scene():
 
 
 def psnr_of(scene, folder, source):
-    """Test PSNR of a training on a source, its views rendered as the true cameras see them, against the true photos."""
+    """Test PSNR of a training on a source, its views rendered as the true cameras see them, against
+    the true photos.
+    """
     config = CONFIG | {"source": {"kind": common.detect(source), "path": str(source)}}
     inputs = {}
     for stage, roles in (("ingest", ()), ("sfm", ("capture",)), ("train", ("capture", "points"))):
@@ -75,7 +87,9 @@ def psnr_of(scene, folder, source):
         k = row[name.rpartition("/")[2]]
         if k % 8 == 0:
             K, image = scene["Ks"][k], scene["images"][k]
-            view = View(torch.from_numpy(K).float(), torch.from_numpy(pose).float(), *image.shape[1::-1])
+            view = View(
+                torch.from_numpy(K).float(), torch.from_numpy(pose).float(), *image.shape[1::-1]
+            )
             errors.append(((renderer.render(view)[0].astype(float) - image) ** 2).mean())
     return float(-10 * np.log10(np.mean(errors) / 255**2))
 
@@ -93,17 +107,25 @@ def colmap(folder, scene, *, model="PINHOLE", more="", name="{}.png", place="spa
            errors=0.5, depth=None, binary=False, file=None, separate=False):  # fmt: skip
     """A model as COLMAP writes one, but for what is asked for.
 
-    way: scale, rotation and shift of the world; name: of a photo in the model, file: on disk (None: the same); size: of
-    photos on disk, parts; more: parameters of the camera behind its pinhole; depth: stored values of the true ones.
+    way: scale, rotation and shift of the world; name: of a photo in the model, file: on disk (None:
+      the same); size: of
+    photos on disk, parts; more: parameters of the camera behind its pinhole; depth: stored values
+    of the true ones.
     """
     scale, turn, shift = way
     K, (height, width) = scene["Ks"][0], scene["images"].shape[1:3]
     assert np.ptp(scene["Ks"], axis=0).max() == 0 and K[0, 0] == K[1, 1]
-    focals = [K[0, 0]] if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else [K[0, 0], K[1, 1]]
+    focals = (
+        [K[0, 0]] if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else [K[0, 0], K[1, 1]]
+    )
     camera = camera.format(w=width, h=height)
-    line = f"{model} {camera} {' '.join(repr(float(v)) for v in (*focals, K[0, 2], K[1, 2]))} {more}"
+    line = (
+        f"{model} {camera} {' '.join(repr(float(v)) for v in (*focals, K[0, 2], K[1, 2]))} {more}"
+    )
     sparse = folder / place
-    layouts.write_text(sparse / "cameras.txt", "".join(f"{k} {line}\n" for k in range(1, 17 if separate else 2)))
+    layouts.write_text(
+        sparse / "cameras.txt", "".join(f"{k} {line}\n" for k in range(1, 17 if separate else 2))
+    )
     points = scale * scene["points"] @ turn.T + shift
     seen = scene["tracks"] if tracks else np.zeros((0, 2), int)
     at, rows = {}, []
@@ -114,7 +136,8 @@ def colmap(folder, scene, *, model="PINHOLE", more="", name="{}.png", place="spa
         quaternion = Rotation.from_matrix(R).as_quat(scalar_first=True)
         written = name.format(scene["names"][k])
         rows.append(
-            f"{k + 1} {' '.join(repr(float(v)) for v in (*quaternion, *t))} {k + 1 if separate else 1} {written}\n"
+            f"{k + 1} {' '.join(repr(float(v)) for v in (*quaternion, *t))} "
+            f"{k + 1 if separate else 1} {written}\n"
         )
         for place_in, row in enumerate(own):
             at[int(row)] = place_in
@@ -123,18 +146,33 @@ def colmap(folder, scene, *, model="PINHOLE", more="", name="{}.png", place="spa
         stored = folder / images / (file or name).format(scene["names"][k])
         photo = Image.fromarray(scene["images"][k])
         stored.parent.mkdir(parents=True, exist_ok=True)
-        photo.resize((width // size, height // size), Image.Resampling.BOX).save(stored, format="PNG")
+        photo.resize((width // size, height // size), Image.Resampling.BOX).save(
+            stored, format="PNG"
+        )
         if depth is not None:
-            values = depth(scene["depth"].astype(float))[k].round().clip(0, 65_535).astype(np.uint16)
+            values = (
+                depth(scene["depth"].astype(float))[k].round().clip(0, 65_535).astype(np.uint16)
+            )
             save(folder / f"depth/{scene['names'][k]}.png", values)
     layouts.write_text(sparse / "images.txt", "".join(rows))
-    starts = np.searchsorted(seen[:, 0], np.arange(len(points) + 1)) if len(seen) else np.zeros(len(points) + 1, int)
-    colored = scene["colors"] if colors is None else np.broadcast_to(np.uint8(colors), scene["colors"].shape)
+    starts = (
+        np.searchsorted(seen[:, 0], np.arange(len(points) + 1))
+        if len(seen)
+        else np.zeros(len(points) + 1, int)
+    )
+    colored = (
+        scene["colors"]
+        if colors is None
+        else np.broadcast_to(np.uint8(colors), scene["colors"].shape)
+    )
     listed = []
     for k, (xyz, rgb) in enumerate(zip(points, colored, strict=True)):
         own = [row for row in range(starts[k], starts[k + 1]) if row in at]
         track = " ".join(f"{seen[row, 1] + 1} {at[row]}" for row in own)
-        listed.append(f"{k + 1} {' '.join(repr(float(v)) for v in xyz)} {' '.join(map(str, rgb))} {errors} {track}\n")
+        listed.append(
+            f"{k + 1} {' '.join(repr(float(v)) for v in xyz)} {' '.join(map(str, rgb))} "
+            f"{errors} {track}\n"
+        )
     layouts.write_text(sparse / "points3D.txt", "".join(listed))
     if binary:
         pycolmap.Reconstruction(str(sparse)).write_binary(str(sparse))
@@ -146,7 +184,14 @@ def transforms(folder, scene, *, shared=None, frame=None, rows=4, path="images/{
                depth=1000.0, document="transforms.json", drop=(), split=False):  # fmt: skip
     """A transforms.json as nerfstudio writes one, with depth, but for what is asked for."""
     K, (height, width) = scene["Ks"][0], scene["images"].shape[1:3]
-    whole = {"w": width, "h": height, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    whole = {
+        "w": width,
+        "h": height,
+        "fl_x": K[0, 0],
+        "fl_y": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+    }
     whole = {key: value for key, value in (whole | (shared or {})).items() if key not in drop}
     frames = []
     for name, image, z, pose in zip(scene["names"], scene["images"], scene["depth"], layouts.world_from_cam(scene),
@@ -163,7 +208,9 @@ def transforms(folder, scene, *, shared=None, frame=None, rows=4, path="images/{
         return
     for part, chosen in (("train", [k for k in range(16) if k % 8]), ("test", [0, 8])):
         listed = [frames[k] for k in chosen]
-        layouts.write_text(folder / f"transforms_{part}.json", json.dumps(whole | {"frames": listed}))
+        layouts.write_text(
+            folder / f"transforms_{part}.json", json.dumps(whole | {"frames": listed})
+        )
 
 
 def after(write, change):
@@ -227,7 +274,8 @@ def holes(z, codes=(65_535,)):
     return stored
 
 
-# (what, how it is written, a word of the line that names the cause where it costs more, or is refused)
+# (what, how it is written, a word of the line that names the cause where it costs more, or is
+# refused)
 POINTS = {
     "text": (C, ""),
     "binary": (partial(C, binary=True), ""),
@@ -235,7 +283,10 @@ POINTS = {
     "SIMPLE_RADIAL without distortion": (partial(C, model="SIMPLE_RADIAL", more="0"), ""),
     "RADIAL without distortion": (partial(C, model="RADIAL", more="0 0"), ""),
     "OPENCV without distortion": (partial(C, model="OPENCV", more="0 0 0 0"), ""),
-    "FULL_OPENCV without distortion": (partial(C, model="FULL_OPENCV", more="0 0 0 0 0 0 0 0"), "FULL_OPENCV"),
+    "FULL_OPENCV without distortion": (
+        partial(C, model="FULL_OPENCV", more="0 0 0 0 0 0 0 0"),
+        "FULL_OPENCV",
+    ),
     "a camera a view": (partial(C, separate=True), ""),
     "black points": (partial(C, colors=0), "colou?r"),
     "white points": (partial(C, colors=255), "colou?r"),
@@ -245,8 +296,14 @@ POINTS = {
     "points whose error is -1": (partial(C, errors=-1), ""),
     "no lines of keypoints": (partial(C, keypoints="", tracks=False), ""),
     "remarks for keypoints": (partial(C, keypoints="# none\n", tracks=False), "images.txt"),
-    "spaces before remarks": (after(C, every("sparse/0/*.txt", lambda text: "  # made by hand\n" + text)), r"\.txt"),
-    "lines as Windows ends them": (after(C, every("sparse/0/*.txt", lambda text: text.replace("\n", "\r\n"))), ""),
+    "spaces before remarks": (
+        after(C, every("sparse/0/*.txt", lambda text: "  # made by hand\n" + text)),
+        r"\.txt",
+    ),
+    "lines as Windows ends them": (
+        after(C, every("sparse/0/*.txt", lambda text: text.replace("\n", "\r\n"))),
+        "",
+    ),
     "empty lines at the end": (after(C, every("sparse/0/*.txt", lambda text: text + "\n\n")), ""),
     "a size with decimals": (partial(C, camera="{w}.0 {h}.0"), "cameras.txt"),
     "a thousandth": (partial(C, way=(1e-3, np.eye(3), np.zeros(3))), ""),
@@ -254,17 +311,29 @@ POINTS = {
     "turned": (partial(C, way=(1.0, TURNED, np.zeros(3))), ""),
     "far away": (partial(C, way=(1.0, np.eye(3), np.array([5e5, -3e5, 100.0]))), ""),
     "very far away": (partial(C, way=(1.0, np.eye(3), np.array([5e6, 4e6, 0.0]))), "far"),
-    "small, turned and far away": (partial(C, way=(0.01, TURNED, np.array([900.0, 4.0, -7.0]))), ""),
+    "small, turned and far away": (
+        partial(C, way=(0.01, TURNED, np.array([900.0, 4.0, -7.0]))),
+        "",
+    ),
     "a small model first": (small_model_first, ""),
     "a model in sparse/": (partial(C, place="sparse"), ""),
     "a model in colmap/sparse/0": (partial(C, place="colmap/sparse/0"), "colmap|is no source"),
     "photos in input/": (partial(C, images="input"), "input|images is missing"),
     "endings in capitals": (partial(C, name="{}.PNG"), ""),
     "endings in capitals on disk": (partial(C, file="{}.PNG"), "absent on disk|usable frames"),
-    "other endings on disk": (partial(C, name="{}.jpg", file="{}.png"), "absent on disk|usable frames"),
-    "folders before names": (partial(C, name="images/{}.png", file="{}.png"), "absent on disk|usable frames"),
+    "other endings on disk": (
+        partial(C, name="{}.jpg", file="{}.png"),
+        "absent on disk|usable frames",
+    ),
+    "folders before names": (
+        partial(C, name="images/{}.png", file="{}.png"),
+        "absent on disk|usable frames",
+    ),
     "folders within images/": (partial(C, name="left/{}.png"), ""),
-    "backslashes": (partial(C, name="left\\{}.png", file="left/{}.png"), "absent on disk|usable frames"),
+    "backslashes": (
+        partial(C, name="left\\{}.png", file="left/{}.png"),
+        "absent on disk|usable frames",
+    ),
     "photos half as large": (partial(C, size=2), "48x36"),
     "images_2 alone": (partial(C, size=2, images="images_2"), "images_2|images is missing"),
     "bytes behind the last point": (after(partial(C, binary=True), trailing), "points3D"),
@@ -296,7 +365,9 @@ DEPTH = {
     "intrinsics of each frame": (lambda folder, scene: transforms(folder, scene, shared={"fl_x": 30.0, "fl_y": 30.0},
         frame={"fl_x": scene["Ks"][0, 0, 0], "fl_y": scene["Ks"][0, 1, 1]}), ""),
 }  # fmt: skip
-WAYS = [(family, name) for family, table in (("points", POINTS), ("depth", DEPTH)) for name in table]
+WAYS = [
+    (family, name) for family, table in (("points", POINTS), ("depth", DEPTH)) for name in table
+]
 
 
 @pytest.fixture(scope="module")
@@ -315,8 +386,12 @@ def test_there_are_forty_ways_and_more():
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("ways")
-@pytest.mark.parametrize(("family", "name"), WAYS, ids=[f"{family}: {name}" for family, name in WAYS])
-def test_a_way_to_write_a_scene_costs_no_decibel_without_a_word(scene, worth, tmp_path, caplog, capfd, family, name):
+@pytest.mark.parametrize(
+    ("family", "name"), WAYS, ids=[f"{family}: {name}" for family, name in WAYS]
+)
+def test_a_way_to_write_a_scene_costs_no_decibel_without_a_word(
+    scene, worth, tmp_path, caplog, capfd, family, name
+):
     write, word = (POINTS if family == "points" else DEPTH)[name]
     write(tmp_path / "scene", scene)
     with caplog.at_level(logging.INFO, "chebsplat"):
@@ -327,4 +402,6 @@ def test_a_way_to_write_a_scene_costs_no_decibel_without_a_word(scene, worth, tm
     said += caplog.text + capfd.readouterr().err
     print(f"{family}: {name}: {found} of {worth[family]} dB")
     if found is None or found < worth[family] - DECIBELS:
-        assert word and re.search(word, said, re.IGNORECASE), f"{found} dB of {worth[family]}: {said[-2000:]}"
+        assert word and re.search(word, said, re.IGNORECASE), (
+            f"{found} dB of {worth[family]}: {said[-2000:]}"
+        )

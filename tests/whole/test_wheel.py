@@ -20,14 +20,27 @@ def source(tmp_path_factory):
 
     def ignored(folder, names):
         here = {"work", "build", "tests", ".git", ".venv"} if folder == str(ROOT) else set()
-        return (here & set(names)) | shutil.ignore_patterns(".*", "*.egg-info", "__pycache__")(folder, names)
+        return (here & set(names)) | shutil.ignore_patterns(".*", "*.egg-info", "__pycache__")(
+            folder, names
+        )
 
-    return shutil.copytree(ROOT, tmp_path_factory.mktemp("wheel") / "source", symlinks=True, ignore=ignored)
+    return shutil.copytree(
+        ROOT, tmp_path_factory.mktemp("wheel") / "source", symlinks=True, ignore=ignored
+    )
 
 
 def build(source, *kind):
     """What `python -m build` makes of a folder."""
-    command = [sys.executable, "-m", "build", *kind, "--no-isolation", "--outdir", f"{source}-dist", str(source)]
+    command = [
+        sys.executable,
+        "-m",
+        "build",
+        *kind,
+        "--no-isolation",
+        "--outdir",
+        f"{source}-dist",
+        str(source),
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return Path(f"{source}-dist")
@@ -64,9 +77,13 @@ def test_an_sdist_and_a_zip_without_links_hold_what_the_wheel_holds(source, buil
 def test_setup_puts_links_in_the_place_of_files_and_says_so_in_one_line(source, tmp_path):
     checkout = with_plain_files(source, tmp_path / "checkout")
     nowhere = os.environ | {"PYTHON": "/nowhere/python"}  # ends it there
-    done = subprocess.run(["bash", "pipelines/setup.sh"], cwd=checkout, env=nowhere, capture_output=True, text=True)
+    done = subprocess.run(
+        ["bash", "pipelines/setup.sh"], cwd=checkout, env=nowhere, capture_output=True, text=True
+    )
     assert "is a file where a link belongs" in done.stderr.splitlines()[0]
-    assert [(checkout / "chebsplat" / name).readlink() for name in LINKS] == [Path("..") / name for name in LINKS]
+    assert [(checkout / "chebsplat" / name).readlink() for name in LINKS] == [
+        Path("..") / name for name in LINKS
+    ]
 
 
 def test_a_wheel_mounts_every_layer_under_chebsplat(wheel):
@@ -115,10 +132,22 @@ print(scene.query(scene.label_names[0], against=scene.label_names[1:]).shape == 
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("toy")
-def test_an_installed_wheel_opens_renders_and_asks_a_scene_from_another_folder(wheel, toy, tmp_path):
+def test_an_installed_wheel_opens_renders_and_asks_a_scene_from_another_folder(
+    wheel, toy, tmp_path
+):
     """All but the wheel itself comes from where the tests run: its dependencies take gigabytes."""
     place, folder = tmp_path / "site", tmp_path / "scene"
-    command = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--target", str(place), str(wheel)]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--no-deps",
+        "--no-index",
+        "--target",
+        str(place),
+        str(wheel),
+    ]
     subprocess.run(command, check=True, capture_output=True)
     folder.mkdir()
     for stage in ("export", "teacher"):
@@ -152,10 +181,28 @@ def test_an_installation_runs_toy_without_setup(kind, built, tmp_path):
     if kind in ("zip", "git") and not (ROOT / ".git").exists():
         pytest.skip("not a checkout")
     place, source = tmp_path / "site", SOURCES[kind](built, tmp_path)
-    command = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--no-build-isolation"]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+    ]
     subprocess.run([*command, "--target", str(place), source], check=True, capture_output=True)
     environment = os.environ | {"PYTHONPATH": str(place), "CHEBSPLAT_WORK": str(tmp_path / "work")}
-    command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "run", "--scene", "toy", "--stage", "export"]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "chebsplat.pipelines.cli",
+        "run",
+        "--scene",
+        "toy",
+        "--stage",
+        "export",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
     assert done.returncode == 0, done.stderr
     ply = tmp_path / "work/toy/export/scene.ply"

@@ -1,8 +1,10 @@
 """`deep-blending`: Deep Blending has no labels, so the teacher's are the truth, as in `replica-f3`.
 
 Resolution: as the photos are, 1600 pixels at most, as in 3DGS: drjohnson 1332 wide, playroom 1264.
-Split: index % 8 == 0 by name, the rule of 3DGS; Feature 3DGS uses 2, so the offset may be set and is recorded. PSNR,
-SSIM and LPIPS (vgg, images in [0, 1] as 3DGS feeds them); frames per second without the semantic branch. Labels,
+Split: index % 8 == 0 by name, the rule of 3DGS; Feature 3DGS uses 2, so the offset may be set and
+  is recorded. PSNR,
+SSIM and LPIPS (vgg, images in [0, 1] as 3DGS feeds them); frames per second without the semantic
+branch. Labels,
 resizing and averaging: see `replica_f3`.
 """
 
@@ -11,6 +13,13 @@ from __future__ import annotations
 from chebsplat.evaluation.protocols.replica_f3 import measure
 
 NAME = "deep-blending"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 8, 0, True, False, False, "teacher"
+TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
+    8,
+    0,
+    True,
+    False,
+    False,
+    "teacher",
+)
 
 __all__ = ["measure"]

@@ -5,9 +5,12 @@ Classes: the scene's own names; a label whose name is no class is wrong wherever
 One confusion matrix over all test views: mIoU over classes that occur in truth or prediction, mAcc
 over those in the truth, OA; mIoU within 5 pixels of a boundary, and over the five classes with the
 fewest pixels; the same for the teacher.
-3D point mIoU, where depth and poses say where pixels lie: over points of the test views' surfaces (40,000 pixels a view
-on a regular grid, of which one a cell is kept: `metrics.thinned`), the scene's label is that of its Gaussians there,
-without rendering; where it has none, it is wrong. The teacher's is the label of the pixel that the point comes from.
+3D point mIoU, where depth and poses say where pixels lie: over points of the test views' surfaces
+  (40,000 pixels a view
+on a regular grid, of which one a cell is kept: `metrics.thinned`), the scene's label is that of its
+  Gaussians there,
+without rendering; where it has none, it is wrong. The teacher's is the label of the pixel that the
+point comes from.
 """
 
 from __future__ import annotations
@@ -22,43 +25,65 @@ from chebsplat.evaluation.protocols.task import EvaluatedView, Task, counted, me
 from chebsplat.labels.decode import decode_labels
 
 NAME = "labels"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 8, 0, True, True, False, "labels"
+TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
+    8,
+    0,
+    True,
+    True,
+    False,
+    "labels",
+)
 
 N_RAREST = 5  # classes whose mean IoU is told apart: what means over a scene hardly show
 PER_VIEW = 40_000  # pixels of a view that become points, about, on a regular grid
 
 
 def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
-    """mIoU (of pixels, boundary pixels and points), mAcc, OA, IoU by class: of the scene, and of its teacher; and what
-    each mIoU rests on (`task.counted`).
+    """mIoU (of pixels, boundary pixels and points), mAcc, OA, IoU by class: of the scene, and of
+    its teacher; and what each mIoU rests on (`task.counted`).
     """
     n = len(task.classes)
     sums: dict[str, np.ndarray] = {}
-    points: list[tuple[np.ndarray, ...]] = []  # (position, truth, teacher's label) of a view's pixels with both
+    # (position, truth, teacher's label) of a view's pixels with both
+    points: list[tuple[np.ndarray, ...]] = []
     for view in views:
         assert view.truth is not None
         inside = np.where(boundary_band(view.truth, task.boundary), view.truth, IGNORE)
         for side, labels in (("scene", view.labels), ("teacher", view.teacher_labels)):
             if labels is not None:
                 prediction = predicted(labels, task.names, task.classes, n)
-                counts = np.stack([confusion(prediction, truth, n + 1) for truth in (view.truth, inside)])
+                counts = np.stack(
+                    [confusion(prediction, truth, n + 1) for truth in (view.truth, inside)]
+                )
                 sums[side] = sums.get(side, 0) + counts
         if view.surface is not None:
             step = max(round((view.truth.size / PER_VIEW) ** 0.5), 1)
             maps = (view.surface.astype(np.float32), view.truth, view.teacher_labels)
-            positions, truth, *of_teacher = (of[step // 2 :: step, step // 2 :: step] for of in maps if of is not None)
+            positions, truth, *of_teacher = (
+                of[step // 2 :: step, step // 2 :: step] for of in maps if of is not None
+            )
             known = (truth != IGNORE) & np.isfinite(positions).all(-1)
             points.append(tuple(of[known] for of in (positions, truth, *of_teacher)))
     figures = {side: _figures(whole, edges, task.classes) for side, (whole, edges) in sums.items()}
-    of_points, there = _point_mious(points, task) if points and task.at is not None else ({}, np.zeros(n))
+    of_points, there = (
+        _point_mious(points, task) if points and task.at is not None else ({}, np.zeros(n))
+    )
     by_class, edge = (part.sum(1)[:-1] for part in sums["scene"])
-    rests = {"miou": by_class, "boundary_miou": edge, "rarest_miou": by_class[rarest(by_class)], "point_miou": there}
-    return {"classes": task.classes, "counted": {name: counted(pixels) for name, pixels in rests.items()}} | {
-        side: of_side | {"point_miou": of_points.get(side)} for side, of_side in figures.items()
+    rests = {
+        "miou": by_class,
+        "boundary_miou": edge,
+        "rarest_miou": by_class[rarest(by_class)],
+        "point_miou": there,
     }
+    return {
+        "classes": task.classes,
+        "counted": {name: counted(pixels) for name, pixels in rests.items()},
+    } | {side: of_side | {"point_miou": of_points.get(side)} for side, of_side in figures.items()}
 
 
-def _point_mious(points: list[tuple[np.ndarray, ...]], task: Task) -> tuple[dict[str, float | None], np.ndarray]:
+def _point_mious(
+    points: list[tuple[np.ndarray, ...]], task: Task
+) -> tuple[dict[str, float | None], np.ndarray]:
     """mIoU of scene and teacher over points of surfaces; how many of these are of each class."""
     assert task.at is not None
     positions, truth, *of_teacher = (np.concatenate(parts) for parts in zip(*points, strict=True))
@@ -69,13 +94,20 @@ def _point_mious(points: list[tuple[np.ndarray, ...]], task: Task) -> tuple[dict
     if of_teacher:
         sides["teacher"] = predicted(of_teacher[0][kept], task.names, task.classes, n)
     there = np.bincount(truth[kept], minlength=n)
-    ious = {side: segmentation(confusion(labels, truth[kept], n + 1)).iou for side, labels in sides.items()}
+    ious = {
+        side: segmentation(confusion(labels, truth[kept], n + 1)).iou
+        for side, labels in sides.items()
+    }
     return {side: mean_over(iou[:-1], there) for side, iou in ious.items()}, there
 
 
 def rarest(pixels: np.ndarray) -> np.ndarray:
-    """Of classes with so many pixels of truth each, the N_RAREST with the fewest, those with none aside."""
-    return np.argsort(np.where(pixels > 0, pixels, np.inf), kind="stable")[: min(N_RAREST, int((pixels > 0).sum()))]
+    """Of classes with so many pixels of truth each, the N_RAREST with the fewest, those with none
+    aside.
+    """
+    return np.argsort(np.where(pixels > 0, pixels, np.inf), kind="stable")[
+        : min(N_RAREST, int((pixels > 0).sum()))
+    ]
 
 
 def _figures(whole: np.ndarray, edges: np.ndarray, classes: list[str]) -> dict[str, Any]:
@@ -87,5 +119,8 @@ def _figures(whole: np.ndarray, edges: np.ndarray, classes: list[str]) -> dict[s
         "oa": None if np.isnan(scores.oa) else scores.oa,
         "boundary_miou": mean_over(segmentation(edges).iou[:-1], edge),
         "rarest_miou": mean_over(scores.iou[rare], pixels[rare]),
-        "iou": {name: None if np.isnan(v) else float(v) for name, v in zip(classes, scores.iou, strict=False)},
+        "iou": {
+            name: None if np.isnan(v) else float(v)
+            for name, v in zip(classes, scores.iou, strict=False)
+        },
     }

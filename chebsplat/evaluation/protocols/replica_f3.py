@@ -1,13 +1,17 @@
-"""`replica-f3` (Feature 3DGS): agreement with the teacher's own labels; no ground truth is looked at.
+"""`replica-f3` (Feature 3DGS): agreement with the teacher's own labels; no ground truth is looked
+at.
 
 Resolution: 640 pixels at most, as Semantic-NeRF's renders have. Split: index % 8 == 2 by name.
 Feature 3DGS sorts its students as text and its teachers as numbers, so that unpadded names pair
-different views; here views are joined on their names. Labels: the 150 names of ADE20K without a prompt
-template; of ids that count from 1, television (90) becomes door (15), rug (29) floor (4), pillow (58) cushion (40).
-Resizing: where a view is wider than 480 pixels, features of both become 480x360, bilinear with aligned corners, which
-distorts; labels then become 159x119 by the nearest pixel. Averaging: by image, mean IoU over the 7 labels that are
-most frequent in teacher and student together, and pixel accuracy; then the mean over images. Labels of equal
-frequency are taken in the order of their ids; Feature 3DGS leaves that open.
+different views; here views are joined on their names. Labels: the 150 names of ADE20K without a
+prompt template; of ids that count from 1, television (90) becomes door (15), rug (29) floor (4),
+pillow (58) cushion (40).
+Resizing: where a view is wider than 480 pixels, features of both become 480x360, bilinear with
+  aligned corners, which
+distorts; labels then become 159x119 by the nearest pixel. Averaging: by image, mean IoU over the 7
+labels that are most frequent in teacher and student together, and pixel accuracy; then the mean
+over images. Labels of equal frequency are taken in the order of their ids; Feature 3DGS leaves that
+open.
 """
 
 from __future__ import annotations
@@ -18,12 +22,26 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import DataFailure
-from chebsplat.evaluation.protocols.task import EvaluatedView, Task, bilinear, counted, mean_over, resized
+from chebsplat.evaluation.protocols.task import (
+    EvaluatedView,
+    Task,
+    bilinear,
+    counted,
+    mean_over,
+    resized,
+)
 from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import folded
 
 NAME = "replica-f3"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 8, 2, False, False, False, "teacher"
+TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
+    8,
+    2,
+    False,
+    False,
+    False,
+    "teacher",
+)
 N_LABELS, N_COUNTED = 150, 7
 MERGED = {90: 15, 29: 4, 58: 40}  # ids from 1
 SPELT = {4: "floor", 15: "door", 29: "rug", 40: "cushion", 58: "pillow", 90: "television"}
@@ -31,15 +49,21 @@ FEATURES, LABELS = (360, 480), (119, 159)  # (H, W)
 
 
 def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
-    """Agreement of the scene with its teacher: mean over images of mIoU and OA; `iou` by label, over its images.
+    """Agreement of the scene with its teacher: mean over images of mIoU and OA; `iou` by label,
+    over its images.
 
     Raises: DataFailure unless the teacher's labels are ADE20K's, and without a teacher.
     """
     names = [folded(name) for name in task.names]
-    wrong = [k for k, name in SPELT.items() if len(names) != N_LABELS or not names[k - 1].startswith(name)]
+    wrong = [
+        k
+        for k, name in SPELT.items()
+        if len(names) != N_LABELS or not names[k - 1].startswith(name)
+    ]
     if wrong:
         raise DataFailure(
-            f"the protocol asks for the 150 labels of ADE20K in their order (label {wrong[0]}: {SPELT[wrong[0]]}); "
+            f"the protocol asks for the 150 labels of ADE20K in their order (label {wrong[0]}: "
+            f"{SPELT[wrong[0]]}); "
             f"the teacher has {len(task.names)}; give it these, or use another protocol"
         )
     rows: list[tuple[float, float]] = []  # (mIoU, OA) of each image
@@ -47,17 +71,30 @@ def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
     of_teacher = np.zeros(N_LABELS + 1, int)
     for view in views:
         if view.teacher is None:
-            raise DataFailure(f"view {view.name} has no features of a teacher, which the protocol compares with")
-        student, teacher = (_labels(f, view, task.embeddings) for f in (view.features, view.teacher))
+            raise DataFailure(
+                f"view {view.name} has no features of a teacher, which the protocol compares with"
+            )
+        student, teacher = (
+            _labels(f, view, task.embeddings) for f in (view.features, view.teacher)
+        )
         ious = frequent_ious(student, teacher)
         rows.append((float(np.mean(list(ious.values()))), float(np.mean(student == teacher))))
         of_teacher += np.bincount(teacher.ravel(), minlength=N_LABELS + 1)
         for k, value in ious.items():
             by_label[k].append(value)
     miou, oa = np.mean(rows, 0)
-    iou = {name: float(np.mean(by_label[k])) if by_label[k] else None for k, name in enumerate(task.names, 1)}
+    iou = {
+        name: float(np.mean(by_label[k])) if by_label[k] else None
+        for k, name in enumerate(task.names, 1)
+    }
     there = {"miou": counted(of_teacher)}
-    scene = {"miou": mean_over(miou, of_teacher), "macc": None, "oa": float(oa), "boundary_miou": None, "iou": iou}
+    scene = {
+        "miou": mean_over(miou, of_teacher),
+        "macc": None,
+        "oa": float(oa),
+        "boundary_miou": None,
+        "iou": iou,
+    }
     return {"classes": task.names, "counted": there, "scene": scene}
 
 
@@ -69,7 +106,9 @@ def _labels(features: np.ndarray, view: EvaluatedView, embeddings: np.ndarray) -
 
 
 def merged(ids: np.ndarray) -> np.ndarray:
-    """Ids from 1 with the merges applied; none is the target of another, so their order does not matter."""
+    """Ids from 1 with the merges applied; none is the target of another, so their order does not
+    matter.
+    """
     table = np.arange(N_LABELS + 1)
     table[list(MERGED)] = list(MERGED.values())
     result: np.ndarray = table[ids]

@@ -10,6 +10,13 @@ from __future__ import annotations
 from chebsplat.evaluation.protocols.labels import measure
 
 NAME = "replica-gt"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 8, 2, False, False, False, "labels"
+TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
+    8,
+    2,
+    False,
+    False,
+    False,
+    "labels",
+)
 
 __all__ = ["measure"]

@@ -1,13 +1,17 @@
 """`scannet-closed` (Panoptic Lifting): 21 reduced classes and void on ScanNet.
 
-Split: that of splits.json, otherwise every 5th frame from the first. Truth: NYU's 40 classes reduced to the 21 below,
-objects corrected by hand in nine scenes; void (0) is masked. Ids differ from `scannet-open` in two places (10 is
-counter, 11 shelves), so labels are joined on names. Resizing: labels to 512x512 by the nearest
-pixel, whatever the aspect; views keep theirs, at 592 pixels at most: of 4:3 as many pixels.
-Averaging: one confusion matrix a scene; a class with less than 0.5 % of both the predicted and the true pixels is
-dropped; void counts as a class of IoU 0 where 0.5 % of the pixels are predicted void; mIoU of the rest; the mean over
-scenes (`averaged`) is not weighted. The peers learn from pseudo labels of Mask2Former with a confidence by pixel, which
-`teacher.kind = "given"` takes from the source; in the measure they play no part.
+Split: that of splits.json, otherwise every 5th frame from the first. Truth: NYU's 40 classes
+  reduced to the 21 below,
+objects corrected by hand in nine scenes; void (0) is masked. Ids differ from `scannet-open` in two
+places (10 is counter, 11 shelves), so labels are joined on names. Resizing: labels to 512x512 by
+the nearest pixel, whatever the aspect; views keep theirs, at 592 pixels at most: of 4:3 as many
+pixels.
+Averaging: one confusion matrix a scene; a class with less than 0.5 % of both the predicted and the
+  true pixels is
+dropped; void counts as a class of IoU 0 where 0.5 % of the pixels are predicted void; mIoU of the
+rest; the mean over scenes (`averaged`) is not weighted. The peers learn from pseudo labels of
+Mask2Former with a confidence by pixel, which `teacher.kind = "given"` takes from the source; in the
+measure they play no part.
 """
 
 from __future__ import annotations
@@ -30,7 +34,14 @@ from chebsplat.evaluation.protocols.task import (
 )
 
 NAME = "scannet-closed"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 5, 0, False, True, False, "labels"
+TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
+    5,
+    0,
+    False,
+    True,
+    False,
+    "labels",
+)
 CLASSES = ("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "counter", "shelves",
            "curtain", "ceiling", "refrigerator", "television", "person", "toilet", "sink", "lamp", "bag",
            "otherprop")  # fmt: skip
@@ -44,7 +55,9 @@ SIZE, RARE = (512, 512), 0.005
 
 
 def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
-    """mIoU of one scene, and IoU by class, None where it is dropped. Raises DataFailure on other labels."""
+    """mIoU of one scene, and IoU by class, None where it is dropped. Raises DataFailure on other
+    labels.
+    """
     required(task.names, CLASSES, NAME, also=(VOID,))
     classes = [VOID, *CLASSES]
     sums: dict[str, np.ndarray] = {}
@@ -54,9 +67,13 @@ def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
         for side, labels in (("scene", view.labels), ("teacher", view.teacher_labels)):
             if labels is not None:
                 prediction = resized(predicted(labels, task.names, classes, 0), SIZE, centred=True)
-                sums[side] = sums.get(side, 0) + confusion(prediction, np.where(truth == 0, -1, truth), len(classes))
+                sums[side] = sums.get(side, 0) + confusion(
+                    prediction, np.where(truth == 0, -1, truth), len(classes)
+                )
     there = {"miou": counted(sums["scene"].sum(1)[1:])}
-    return {"classes": list(CLASSES), "counted": there} | {side: figures(matrix) for side, matrix in sums.items()}
+    return {"classes": list(CLASSES), "counted": there} | {
+        side: figures(matrix) for side, matrix in sums.items()
+    }
 
 
 def figures(matrix: np.ndarray) -> dict[str, Any]:

@@ -1,11 +1,17 @@
-"""`scannet-open` (Semantic Gaussians): open vocabulary on 12 scenes of ScanNet, measured on the training cameras.
+"""`scannet-open` (Semantic Gaussians): open vocabulary on 12 scenes of ScanNet, measured on the
+training cameras.
 
-Split: no view is held out, and every view is evaluated. Truth: `label-filt` through column `cocomapid`; 0 is ignored.
-Classes: the 20 below in this order; ids differ from `scannet-closed` in two places (10 is shelves, 11 counter), so
-labels are joined on names, never on ids. A leading prompt "other" is dropped before the largest cosine is taken: no
-pixel can be "other". Resizing: views are 648 pixels wide at most; predictions and truth are compared at
-648x484, nearest pixel. Averaging: ONE confusion matrix summed over all scenes (`summed`); a class that is absent
-from the truth is skipped, even where it is predicted; mIoU and mAcc. A scene's own figures are those of its matrix.
+Split: no view is held out, and every view is evaluated. Truth: `label-filt` through column
+  `cocomapid`; 0 is ignored.
+Classes: the 20 below in this order; ids differ from `scannet-closed` in two places (10 is shelves,
+  11 counter), so
+labels are joined on names, never on ids. A leading prompt "other" is dropped before the largest
+cosine is taken: no pixel can be "other". Resizing: views are 648 pixels wide at most; predictions
+  and truth are compared at
+648x484, nearest pixel. Averaging: ONE confusion matrix summed over all scenes (`summed`); a class
+  that is absent
+from the truth is skipped, even where it is predicted; mIoU and mAcc. A scene's own figures are
+those of its matrix.
 """
 
 from __future__ import annotations
@@ -16,12 +22,27 @@ from typing import Any
 import numpy as np
 
 from chebsplat.evaluation.metrics import confusion
-from chebsplat.evaluation.protocols.task import EvaluatedView, Task, counted, mean_over, required, resized, translated
+from chebsplat.evaluation.protocols.task import (
+    EvaluatedView,
+    Task,
+    counted,
+    mean_over,
+    required,
+    resized,
+    translated,
+)
 from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import joined
 
 NAME = "scannet-open"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = 1, 0, False, False, True, "labels"
+TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
+    1,
+    0,
+    False,
+    False,
+    True,
+    "labels",
+)
 CLASSES = ("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "shelves", "counter",
            "curtain", "ceiling", "refrigerator", "television", "person", "toilet", "sink", "lamp", "bag")  # fmt: skip
 OTHER = "other"
@@ -29,7 +50,9 @@ SIZE = (484, 648)  # (H, W)
 
 
 def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
-    """Figures of one scene, and its `confusion` [20, 20] by truth, to be summed over scenes. Raises DataFailure."""
+    """Figures of one scene, and its `confusion` [20, 20] by truth, to be summed over scenes. Raises
+    DataFailure.
+    """
     required(task.names, CLASSES, NAME, also=(OTHER,))
     asked = [k for k, name in enumerate(task.names) if joined(name) != OTHER]
     names, embeddings = [task.names[k] for k in asked], task.embeddings[asked]
@@ -38,13 +61,17 @@ def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
     for view in views:
         assert view.truth is not None
         truth = resized(translated(view.truth, task.classes, classes, -1), SIZE, centred=True)
-        sides = {"scene": view.features} | ({} if view.teacher is None else {"teacher": view.teacher})
+        sides = {"scene": view.features} | (
+            {} if view.teacher is None else {"teacher": view.teacher}
+        )
         for side, features in sides.items():
             labels = translated(decode_labels(features, embeddings), names, classes, -1)
             prediction = resized(labels, SIZE, centred=True)
             sums[side] = sums.get(side, 0) + confusion(prediction, truth, len(classes))
     there = {"miou": counted(sums["scene"].sum(1))}
-    return {"classes": classes, "counted": there} | {side: summed([matrix]) for side, matrix in sums.items()}
+    return {"classes": classes, "counted": there} | {
+        side: summed([matrix]) for side, matrix in sums.items()
+    }
 
 
 def over_scenes(scenes: list[dict[str, Any]]) -> dict[str, Any]:
@@ -58,7 +85,10 @@ def summed(matrices: list[np.ndarray]) -> dict[str, Any]:
     right, truth = np.diag(matrix).astype(float), matrix.sum(1)
     present = truth > 0
     iou = right[present] / (truth + matrix.sum(0) - right)[present]
-    mean = {"miou": mean_over(iou, truth), "macc": mean_over(right[present] / truth[present], truth)}
+    mean = {
+        "miou": mean_over(iou, truth),
+        "macc": mean_over(right[present] / truth[present], truth),
+    }
     by_class = dict(zip(np.array(CLASSES)[present].tolist(), iou.tolist(), strict=True))
     return mean | {
         "oa": float(right.sum() / matrix.sum()) if present.any() else None,

@@ -1,4 +1,6 @@
-"""What a protocol measures: one view after another, what their labels mean, and which are test views."""
+"""What a protocol measures: one view after another, what their labels mean, and which are test
+views.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ class EvaluatedView:
     features: f32 [H, W, C] as rendered; labels: i16 [H, W] their label among the task's `names`.
     teacher:  f32 [h, w, C] and teacher_labels i16 [H, W], None without a teacher.
     truth:    i16 [H, W] index into the task's `classes`, IGNORE where unknown; None without labels.
-    surface:  f64 [H, W, 3] where in the world its pixels lie, nan where unknown; None without depth.
+    surface:  f64 [H, W, 3] where in the world its pixels lie, nan where unknown; None without
+      depth.
     """
 
     name: str
@@ -34,9 +37,11 @@ class EvaluatedView:
 
 @dataclass
 class Task:
-    """names, embeddings [L, C] of the labels that features are asked for; classes of the truth; boundary: pixels.
+    """names, embeddings [L, C] of the labels that features are asked for; classes of the truth;
+    boundary: pixels.
 
-    at: points [M, 3] of the world -> features [M, C] of the scene there and their weights [M], 0 where it has nothing.
+    at: points [M, 3] of the world -> features [M, C] of the scene there and their weights [M], 0
+      where it has nothing.
     """
 
     names: list[str]
@@ -47,10 +52,16 @@ class Task:
 
 
 class MapsByName(Mapping[str, np.ndarray]):
-    """Rows of a stack by view name, read when asked for: views are joined on names, never on position."""
+    """Rows of a stack by view name, read when asked for: views are joined on names, never on
+    position.
+    """
 
     def __init__(self, names: list[str], stack: Any, what: str):
-        self.rows, self.stack, self.what = {name: row for row, name in enumerate(names)}, stack, what
+        self.rows, self.stack, self.what = (
+            {name: row for row, name in enumerate(names)},
+            stack,
+            what,
+        )
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.rows:
@@ -65,12 +76,15 @@ class MapsByName(Mapping[str, np.ndarray]):
 
 
 def counted(pixels: np.ndarray) -> dict[str, int]:
-    """What a mean over classes rests on: how many `classes` the truth has, and its `pixels`, of [L] counts by class."""
+    """What a mean over classes rests on: how many `classes` the truth has, and its `pixels`, of [L]
+    counts by class.
+    """
     return {"classes": int((pixels > 0).sum()), "pixels": int(pixels.sum())}
 
 
 def mean_over(values: np.ndarray, pixels: np.ndarray) -> float | None:
-    """Mean of the figures of classes that are defined, not nan; None where the truth, of so many `pixels` by class,
+    """Mean of the figures of classes that are defined, not nan; None where the truth, of so many
+    `pixels` by class,
     has fewer than two: of one class alone any scene that knows no other has 100 %.
     """
     if counted(pixels)["classes"] < 2 or np.isnan(values).all():
@@ -78,45 +92,72 @@ def mean_over(values: np.ndarray, pixels: np.ndarray) -> float | None:
     return float(np.nanmean(values))
 
 
-def translated(labels: np.ndarray, names: list[str], classes: list[str], unknown: int) -> np.ndarray:
-    """Labels among `names` as indices into `classes`, IGNORE kept; a name that is no class becomes `unknown`."""
+def translated(
+    labels: np.ndarray, names: list[str], classes: list[str], unknown: int
+) -> np.ndarray:
+    """Labels among `names` as indices into `classes`, IGNORE kept; a name that is no class becomes
+    `unknown`.
+    """
     table = np.array([*(unknown if row < 0 else row for row in rows_of(names, classes)), IGNORE])
     result: np.ndarray = table[labels]
     return result
 
 
 def predicted(labels: np.ndarray, names: list[str], classes: list[str], unknown: int) -> np.ndarray:
-    """As `translated`, of a prediction: where there is none, it is `unknown` too, and not left out of the count."""
+    """As `translated`, of a prediction: where there is none, it is `unknown` too, and not left out
+    of the count.
+    """
     return np.where(labels == IGNORE, unknown, translated(labels, names, classes, unknown))
 
 
-def required(names: list[str], classes: tuple[str, ...], protocol: str, also: tuple[str, ...] = ()) -> None:
-    """Raise DataFailure unless `names` are all the `classes`, in any order, and nothing else but some of `also`."""
+def required(
+    names: list[str], classes: tuple[str, ...], protocol: str, also: tuple[str, ...] = ()
+) -> None:
+    """Raise DataFailure unless `names` are all the `classes`, in any order, and nothing else but
+    some of `also`.
+    """
     if absent := lacking(classes, names):
-        raise DataFailure(f"{protocol} asks for its {len(classes)} classes; the teacher has no {', '.join(absent)}")
+        raise DataFailure(
+            f"{protocol} asks for its {len(classes)} classes; the teacher has no "
+            f"{', '.join(absent)}"
+        )
     if foreign := lacking(names, (*classes, *also)):
-        raise DataFailure(f"{protocol} knows no {', '.join(foreign)}; give the teacher the protocol's classes alone")
+        raise DataFailure(
+            f"{protocol} knows no {', '.join(foreign)}; give the teacher the "
+            "protocol's classes alone"
+        )
 
 
 def resized(labels: np.ndarray, size: tuple[int, int], centred: bool = False) -> np.ndarray:
     """Labels [h, w] at size (H, W) by the nearest pixel.
 
-    Choices: the pixel that holds the corner of the new one, as torch does it; `centred`: its centre, as PIL does.
+    Choices: the pixel that holds the corner of the new one, as torch does it; `centred`: its
+      centre, as PIL does.
     """
     rows, columns = (
-        np.minimum((2 * np.arange(n) + centred) * m // (2 * n), m - 1) for n, m in zip(size, labels.shape, strict=True)
+        np.minimum((2 * np.arange(n) + centred) * m // (2 * n), m - 1)
+        for n, m in zip(size, labels.shape, strict=True)
     )
     nearest: np.ndarray = labels[rows[:, None], columns]
     return nearest
 
 
 def bilinear(features: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Features [h, w, C] at size (H, W); the corner pixels' centres stay the corners ("align_corners")."""
+    """Features [h, w, C] at size (H, W); the corner pixels' centres stay the corners
+    ("align_corners").
+    """
     for axis, n in enumerate(size):
         m = features.shape[axis]
         at = np.linspace(0, m - 1, n)
         low = np.minimum(at.astype(int), max(m - 2, 0))
-        share = (at - low).astype(np.float32).reshape([-1 if k == axis else 1 for k in range(features.ndim)])
-        below, above = np.take(features, low, axis), np.take(features, np.minimum(low + 1, m - 1), axis)
+        share = (
+            (at - low)
+            .astype(np.float32)
+            .reshape([-1 if k == axis else 1 for k in range(features.ndim)])
+        )
+        below, above = (
+            np.take(features, low, axis),
+            np.take(features, np.minimum(low + 1, m - 1), axis),
+        )
         features = below * (1 - share) + above * share
     return features

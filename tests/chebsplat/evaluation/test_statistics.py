@@ -15,7 +15,8 @@ def test_spread_is_the_sample_deviation_and_unknown_of_one_value():
 
 
 def test_over_scenes_the_interval_counts_scenes_not_seeds():
-    # a: +1, +3, mean 2; b: +4, +6, mean 5. Mean 3.5, deviation of {2, 5} 2.12132, error 1.5, quantile 12.7062.
+    # a: +1, +3, mean 2; b: +4, +6, mean 5. Mean 3.5, deviation of {2, 5} 2.12132, error 1.5,
+    # quantile 12.7062.
     found = paired_difference([11, 13, 14, 16], [10, 10, 10, 10], ["a", "a", "b", "b"])
     assert found.mean == 3.5
     assert found.error == pytest.approx(1.5)
@@ -24,8 +25,12 @@ def test_over_scenes_the_interval_counts_scenes_not_seeds():
     assert (found.n_pairs, found.n_units, found.excluded) == (4, 2, False)
 
 
-@pytest.mark.parametrize(("steps", "excluded"), [((1, 2, 3), False), ((2, 3, 4), True), ((-2, -3, -4), True)])
-def test_over_the_seeds_of_one_scene_an_interval_of_three_reaches_2_4841_deviations(steps, excluded):
+@pytest.mark.parametrize(
+    ("steps", "excluded"), [((1, 2, 3), False), ((2, 3, 4), True), ((-2, -3, -4), True)]
+)
+def test_over_the_seeds_of_one_scene_an_interval_of_three_reaches_2_4841_deviations(
+    steps, excluded
+):
     found = paired_difference(np.array(steps), np.zeros(3), ["a"] * 3)
     assert found.high - found.mean == pytest.approx(4.30265 / math.sqrt(3), abs=1e-4)
     assert found.excluded is excluded

@@ -1,4 +1,6 @@
-"""What a scene means at points of space: every Gaussian that reaches has its share, and areas count alike."""
+"""What a scene means at points of space: every Gaussian that reaches has its share, and areas count
+alike.
+"""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -9,7 +11,13 @@ from chebsplat.evaluation.metrics import CELLS, REACH, features_at, thinned
 def gaussians(n, seed=0):
     rng = np.random.default_rng(seed)
     quats = rng.normal(size=(n, 4))
-    return (rng.random((n, 3)), quats, rng.uniform(0.01, 0.2, (n, 3)), rng.random(n), rng.normal(size=(n, 5)))
+    return (
+        rng.random((n, 3)),
+        quats,
+        rng.uniform(0.01, 0.2, (n, 3)),
+        rng.random(n),
+        rng.normal(size=(n, 5)),
+    )
 
 
 def test_features_are_the_weighted_mean_over_all_gaussians():
@@ -25,7 +33,10 @@ def test_features_are_the_weighted_mean_over_all_gaussians():
     assert np.abs(weights - weight.sum(1)).max() < 1e-4
     reached = weights > 0
     assert 20 < reached.sum() < 280
-    assert np.abs(found[reached] - weight[reached] @ features / weight[reached].sum(1)[:, None]).max() < 1e-4
+    assert (
+        np.abs(found[reached] - weight[reached] @ features / weight[reached].sum(1)[:, None]).max()
+        < 1e-4
+    )
     assert (found[~reached] == 0).all()
 
 
@@ -39,7 +50,10 @@ def test_a_point_beyond_every_gaussian_and_a_scene_of_none_have_no_weight():
 
 def test_one_point_a_cell_is_kept_however_dense_they_lie_and_whatever_strays():
     rng = np.random.default_rng(0)
-    dense, sparse = rng.random((200_000, 3)) * [0.5, 1, 0], rng.random((50_000, 3)) * [0.5, 1, 0] + [0.5, 0, 0]
+    dense, sparse = (
+        rng.random((200_000, 3)) * [0.5, 1, 0],
+        rng.random((50_000, 3)) * [0.5, 1, 0] + [0.5, 0, 0],
+    )
     points = np.concatenate([dense, sparse, [[900.0, 0, 0]]])
     kept = thinned(points)
     left = (points[kept, 0] < 0.5).sum()

@@ -1,4 +1,6 @@
-"""Kernels are compiled with a word on it, kept where the user says, and a disk that takes nothing costs no run."""
+"""Kernels are compiled with a word on it, kept where the user says, and a disk that takes nothing
+costs no run.
+"""
 
 import os
 import shutil
@@ -58,7 +60,14 @@ def test_a_home_folder_that_takes_nothing_costs_no_run(tmp_path, how):
     if (unshare := namespace()) is None:
         pytest.skip("nothing can be mounted here (root, or user namespaces, are needed)")
     (tmp_path / "home").mkdir()
-    mount = [*unshare, "sh", "-c", 'mount -t tmpfs -o "$0" tmpfs "$1" && shift && exec "$@"', how, tmp_path / "home"]
+    mount = [
+        *unshare,
+        "sh",
+        "-c",
+        'mount -t tmpfs -o "$0" tmpfs "$1" && shift && exec "$@"',
+        how,
+        tmp_path / "home",
+    ]
     done = run(tmp_path, mount, HOME=str(tmp_path / "home"), CHEBSPLAT_WORK=str(tmp_path / "work"))
     assert done.stdout.startswith("6 1 "), done.stderr
     assert f"{tmp_path}/home/.cache/chebsplat" in done.stderr
@@ -78,10 +87,16 @@ print(jit.__file__, jit.compilation.kernels)
 def test_another_clone_of_the_same_source_finds_what_was_compiled(tmp_path):
     counts = []
     for name in ("first", "second"):
-        shutil.copytree(Path(chebsplat.__file__).parent, tmp_path / name / "chebsplat", copy_function=shutil.copy)
+        shutil.copytree(
+            Path(chebsplat.__file__).parent,
+            tmp_path / name / "chebsplat",
+            copy_function=shutil.copy,
+        )
         env = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
         env |= {"CHEBSPLAT_CACHE": str(tmp_path / "kept"), "PYTHONPATH": str(tmp_path / name)}
-        done = subprocess.run([sys.executable, "-P", "-c", CLONE], capture_output=True, text=True, env=env)
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", CLONE], capture_output=True, text=True, env=env
+        )
         assert done.stdout.startswith(str(tmp_path / name)), done.stderr
         counts.append(int(done.stdout.split()[-1]))
     assert counts[0] > 0

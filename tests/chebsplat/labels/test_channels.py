@@ -1,4 +1,6 @@
-"""The map of a teacher's channels: exact, streamed, independent of order, and it keeps what words are told apart by."""
+"""The map of a teacher's channels: exact, streamed, independent of order, and it keeps what words
+are told apart by.
+"""
 
 import numpy as np
 import pytest
@@ -41,7 +43,9 @@ def test_features_of_a_rank_come_through_as_many_channels_exactly(rank, extra, s
     assert np.allclose(energy[rank - 1 :], 1, atol=1e-12)
     restored = features @ matrix @ matrix.T
     assert np.linalg.norm(restored - features) < 1e-6 * np.linalg.norm(features)
-    assert np.allclose((features @ matrix) @ (vocabulary @ matrix).T, features @ vocabulary.T, atol=1e-6)
+    assert np.allclose(
+        (features @ matrix) @ (vocabulary @ matrix).T, features @ vocabulary.T, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("n_channels", [1, 5, 24])
@@ -80,7 +84,9 @@ def test_a_large_view_is_summed_in_float64():
     values = np.full((ROWS + 5, 2), 0.1, np.float32)
     found = moments(values)
     assert found.count == ROWS + 5
-    assert found.products[0, 1] == pytest.approx((ROWS + 5) * float(np.float32(0.1)) ** 2, rel=1e-12)
+    assert found.products[0, 1] == pytest.approx(
+        (ROWS + 5) * float(np.float32(0.1)) ** 2, rel=1e-12
+    )
 
 
 def test_the_vocabulary_saves_label_decisions():
@@ -125,7 +131,10 @@ def test_a_channel_map_reads_back_and_restores(tmp_path):
     record = ChannelMap(matrix, matrix.T.copy(), energy, "lseg", {"n_pixels": 400})
     found = ChannelMap.read(published(tmp_path / "p", record))
     assert (found.teacher, found.notes) == ("lseg", {"n_pixels": 400})
-    assert all(np.array_equal(getattr(found, k), getattr(record, k)) for k in ("matrix", "inverse", "energy"))
+    assert all(
+        np.array_equal(getattr(found, k), getattr(record, k))
+        for k in ("matrix", "inverse", "energy")
+    )
     features = low_rank(8, 12).reshape(20, 20, 12)
     once = found.restore(found.apply(features))
     assert np.allclose(found.restore(found.apply(once)), once, atol=1e-4)

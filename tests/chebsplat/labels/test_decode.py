@@ -1,4 +1,6 @@
-"""Codes of names lie apart, labels decode from them, and noise confuses as many segments as it is told to."""
+"""Codes of names lie apart, labels decode from them, and noise confuses as many segments as it is
+told to.
+"""
 
 import numpy as np
 
@@ -10,7 +12,9 @@ def test_code_vectors_are_a_function_of_the_name_and_lie_apart():
     codes = class_codes(list(VOCABULARY), 13)
     gram = codes @ codes.T - 2 * np.eye(len(codes))
     assert gram.max() < 0.35
-    assert np.array_equal(class_codes(["sofa", "Tableware"], 13)[0], codes[VOCABULARY.index("sofa")])
+    assert np.array_equal(
+        class_codes(["sofa", "Tableware"], 13)[0], codes[VOCABULARY.index("sofa")]
+    )
     assert np.array_equal(class_codes(["Tableware"], 13), class_codes(["x", "Tableware"], 13)[1:])
 
 
@@ -53,4 +57,6 @@ def test_labels_are_told_in_parts_as_they_are_in_one():
     cosines = features / np.linalg.norm(features, axis=-1, keepdims=True) @ embeddings.T
     assert np.array_equal(labels, cosines.argmax(-1))
     assert np.array_equal(labels, decode_labels(features, embeddings))
-    assert np.allclose(confidence, 1 / np.exp((cosines - cosines.max(-1, keepdims=True)) / 0.1).sum(-1))
+    assert np.allclose(
+        confidence, 1 / np.exp((cosines - cosines.max(-1, keepdims=True)) / 0.1).sum(-1)
+    )

@@ -1,11 +1,16 @@
-"""Information outlives what labels are called, a changed quarter is found, and floors lie below ceilings."""
+"""Information outlives what labels are called, a changed quarter is found, and floors lie below
+ceilings.
+"""
 
 import numpy as np
 import pytest
 
 from chebsplat.labels.plausible import QUARTERS, changes, information, sense, soft, spread
 
-NAMES, INDOORS = ["wall", "sky", "floor", "tree", "ceiling"], frozenset({"wall", "floor", "ceiling"})
+NAMES, INDOORS = (
+    ["wall", "sky", "floor", "tree", "ceiling"],
+    frozenset({"wall", "floor", "ceiling"}),
+)
 
 
 def one_hot(labels, n=5):

@@ -1,4 +1,6 @@
-"""Pseudo labels that a source brings: pixels vote as much as they are sure, and none is no label."""
+"""Pseudo labels that a source brings: pixels vote as much as they are sure, and none is no
+label.
+"""
 
 import numpy as np
 import pytest
@@ -31,8 +33,14 @@ def test_votes_on_paper():
 
 def test_a_cell_without_a_label_or_without_confidence_is_taught_nothing():
     for found, sure in ((-1, 1.0), (2, 0.0)):
-        features, winners, confidence = voted(np.full((4, 4), found, np.int16), np.full((4, 4), sure), CODES, 4)
-        assert (features.tolist(), winners.tolist(), confidence.tolist()) == ([[[0, 0, 0]]], [[-1]], [[0]])
+        features, winners, confidence = voted(
+            np.full((4, 4), found, np.int16), np.full((4, 4), sure), CODES, 4
+        )
+        assert (features.tolist(), winners.tolist(), confidence.tolist()) == (
+            [[[0, 0, 0]]],
+            [[-1]],
+            [[0]],
+        )
 
 
 def test_where_a_teacher_has_no_label_it_is_wrong():
@@ -55,7 +63,9 @@ def test_a_scene_learns_from_its_source_s_pseudo_labels(toy, tmp_path, capsys):
     with publish(tmp_path / "capture", Manifest("chebsplat.capture/2", KEY, "ingest")) as tmp:
         record.write(tmp)
     config = TOY | {"teacher": {"kind": "given", "downscale": 4}}
-    assert run_stage("teacher", tmp_path / "teacher", {"capture": tmp_path / "capture"}, config) == 0
+    assert (
+        run_stage("teacher", tmp_path / "teacher", {"capture": tmp_path / "capture"}, config) == 0
+    )
     features = Features.read(tmp_path / "teacher")
     told = np.asarray(features.pseudo_labels[:])
     assert features.label_names == record.class_names
@@ -66,7 +76,9 @@ def test_a_scene_learns_from_its_source_s_pseudo_labels(toy, tmp_path, capsys):
     assert "no pseudo labels" in capsys.readouterr().err
 
 
-def test_pseudo_labels_that_the_source_does_not_bring_are_refused_before_anything_runs(tmp_path, monkeypatch):
+def test_pseudo_labels_that_the_source_does_not_bring_are_refused_before_anything_runs(
+    tmp_path, monkeypatch
+):
     from chebsplat.pipelines.planning.plan import Planner
 
     monkeypatch.setenv("CHEBSPLAT_WORK", str(tmp_path))

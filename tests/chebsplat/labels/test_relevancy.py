@@ -20,7 +20,9 @@ def sample():
 def test_relevancy_is_the_smallest_pairwise_softmax_share(sample):
     features, query, against = sample
     cosines, rivals = unit(features) @ query, unit(features) @ against.T
-    shares = np.exp(cosines / 0.1)[:, None] / (np.exp(cosines / 0.1)[:, None] + np.exp(rivals / 0.1))
+    shares = np.exp(cosines / 0.1)[:, None] / (
+        np.exp(cosines / 0.1)[:, None] + np.exp(rivals / 0.1)
+    )
     found = relevancy(features, query, against)
     assert found.dtype == np.float32
     assert np.allclose(found, shares.min(1), atol=1e-6)

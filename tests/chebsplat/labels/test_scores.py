@@ -1,4 +1,6 @@
-"""What a segmenter gives is told by its values, and stands for the same probabilities however it was exported."""
+"""What a segmenter gives is told by its values, and stands for the same probabilities however it
+was exported.
+"""
 
 import numpy as np
 import pytest

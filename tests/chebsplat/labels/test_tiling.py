@@ -8,7 +8,9 @@ import pytest
 from chebsplat.labels.tiling import OVERLAP, blended, sampling, window_starts
 
 
-@pytest.mark.parametrize(("length", "window"), [(480, 480), (481, 480), (300, 480), (520, 480), (1000, 480), (97, 12)])
+@pytest.mark.parametrize(
+    ("length", "window"), [(480, 480), (481, 480), (300, 480), (520, 480), (1000, 480), (97, 12)]
+)
 def test_windows_cover_an_axis_and_overlap(length, window):
     starts = window_starts(length, window)
     assert starts[0] == 0
@@ -45,7 +47,8 @@ def test_a_field_seen_through_windows_is_the_field(size, stride):
     found = blended(encode, size, window, grid)
     truth = field(*((np.arange(n) + 0.5) * side / n for n, side in zip(grid, size, strict=True)))
     error = np.abs(found - truth)
-    assert error.max() < 0.15  # at the border there is no cell beyond the last to interpolate with: 2 pixels of slope
+    # at the border there is no cell beyond the last to interpolate with: 2 pixels of slope
+    assert error.max() < 0.15
     assert error[1:-1, 1:-1].max() < 0.03
 
 

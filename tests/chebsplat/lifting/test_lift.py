@@ -1,4 +1,6 @@
-"""The lift equals its float64 transcription for any number of threads; averages and evidence are what they say."""
+"""The lift equals its float64 transcription for any number of threads; averages and evidence are
+what they say.
+"""
 
 import numpy as np
 import pytest
@@ -95,7 +97,9 @@ def test_maps_of_other_grids_are_averaged_by_area(shape):
         for j in range(5):
             block = np.s_[i * step : (i + 1) * step, j * step : (j + 1) * step]
             assert share[i, j] == pytest.approx(q[block].mean(), rel=1e-5)
-            np.testing.assert_allclose(said[i, j], b[block].mean((0, 1)) / q[block].mean(), rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(
+                said[i, j], b[block].mean((0, 1)) / q[block].mean(), rtol=1e-4, atol=1e-5
+            )
 
 
 def observations(seed=0, n=40, n_views=9):
@@ -106,7 +110,9 @@ def observations(seed=0, n=40, n_views=9):
         index = np.flatnonzero(rng.random(n) < 0.7)
         index = index[index > 0].astype(np.int32)
         weights = rng.random(len(index)).astype(np.float32) + 0.01
-        sums = weights[:, None] * rng.normal([1, 0, 0, 0, 0], 0.3, (len(index), 5)).astype(np.float32)
+        sums = weights[:, None] * rng.normal([1, 0, 0, 0, 0], 0.3, (len(index), 5)).astype(
+            np.float32
+        )
         views.append(Lifted(index, weights, sums.astype(np.float32)))
     return gathered(n, 5, views)
 

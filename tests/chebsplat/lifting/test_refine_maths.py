@@ -1,4 +1,6 @@
-"""Smoothing, blend, calibration and carrying over: transcriptions in float64, and what must hold at the extremes."""
+"""Smoothing, blend, calibration and carrying over: transcriptions in float64, and what must hold at
+the extremes.
+"""
 
 import math
 
@@ -19,7 +21,14 @@ from chebsplat.lifting.blend import (
     start,
 )
 from chebsplat.lifting.observations import carry
-from chebsplat.lifting.smoothing import N_NEIGHBORS, REACH, Affinities, affinities, room_unit, smooth
+from chebsplat.lifting.smoothing import (
+    N_NEIGHBORS,
+    REACH,
+    Affinities,
+    affinities,
+    room_unit,
+    smooth,
+)
 
 
 def unit(vectors):
@@ -41,12 +50,22 @@ def transcribed(means, normals, colors, features, evidence, scale):
     for i in range(len(means)):
         offsets = (means - means[i]) / scale
         distances = np.linalg.norm(offsets, axis=1)
-        nearest = [j for j in np.argsort(distances) if j != i and distances[j] <= REACH][:N_NEIGHBORS]
+        nearest = [j for j in np.argsort(distances) if j != i and distances[j] <= REACH][
+            :N_NEIGHBORS
+        ]
         sums, total = evidence[i] * features[i], float(evidence[i])
         for j in nearest:
             angle = math.acos(min(abs(float(normals[i] @ normals[j])), 1.0))
-            across, tone = float(normals[i] @ offsets[j]), float(((colors[i] - colors[j]) ** 2).sum())
-            exponent = distances[j] ** 2 / 0.15**2 + tone / 0.1**2 + angle**2 / 0.5**2 + across**2 / 0.03**2
+            across, tone = (
+                float(normals[i] @ offsets[j]),
+                float(((colors[i] - colors[j]) ** 2).sum()),
+            )
+            exponent = (
+                distances[j] ** 2 / 0.15**2
+                + tone / 0.1**2
+                + angle**2 / 0.5**2
+                + across**2 / 0.03**2
+            )
             weight = math.exp(-exponent / 2) * evidence[j]
             sums, total = sums + weight * features[j], total + weight
         smoothed.append(sums / total if total > 0 else features[i])
@@ -60,7 +79,9 @@ def test_smoothing_is_its_formula_in_scenes_of_any_unit(scene, scale):
     assert ((near.weights > 0).sum(1) == N_NEIGHBORS).any()
     found = smooth(features, evidence, near)
     # float32 features and weights
-    np.testing.assert_allclose(found, transcribed(means, normals, colors, features, evidence, 1.0), atol=1e-5)
+    np.testing.assert_allclose(
+        found, transcribed(means, normals, colors, features, evidence, 1.0), atol=1e-5
+    )
     assert np.abs(found - features).max() > 0.1
 
 
@@ -84,9 +105,16 @@ def test_smoothing_stops_at_colors_creases_and_steps():
 @pytest.mark.parametrize("case", ["coincident", "far", "no evidence", "one color"])
 def test_smoothing_is_finite_at_the_extremes(n, case):
     rng = np.random.default_rng(1)
-    means = np.full((n, 3), 1e3) if case == "coincident" else rng.normal(size=(n, 3)) * (1e6 if case == "far" else 1)
+    means = (
+        np.full((n, 3), 1e3)
+        if case == "coincident"
+        else rng.normal(size=(n, 3)) * (1e6 if case == "far" else 1)
+    )
     colors, normals = np.full((n, 3), 0.3), np.tile([0.0, 1, 0], (n, 1))
-    features, evidence = rng.normal(size=(n, 3)).astype(np.float32), np.full(n, float(case != "no evidence"))
+    features, evidence = (
+        rng.normal(size=(n, 3)).astype(np.float32),
+        np.full(n, float(case != "no evidence")),
+    )
     assert np.isfinite(room_unit(means))
     assert room_unit(means) > 0
     found = smooth(features, evidence, affinities(means, normals, colors))
@@ -100,7 +128,11 @@ def test_smoothing_is_finite_at_the_extremes(n, case):
 
 def test_what_no_view_sees_takes_what_its_neighbours_say_and_gives_nothing():
     means, normals = np.array([[0, 0, 0], [0.05, 0, 0.0]]), np.tile([0.0, 0, 1], (2, 1))
-    found = smooth(np.array([[0.0, 9], [1, 0]]), np.array([0, 3]), affinities(means, normals, np.full((2, 3), 0.5)))
+    found = smooth(
+        np.array([[0.0, 9], [1, 0]]),
+        np.array([0, 3]),
+        affinities(means, normals, np.full((2, 3), 0.5)),
+    )
     np.testing.assert_allclose(found, [[1, 0], [1, 0]], atol=1e-6)
 
 
@@ -115,16 +147,26 @@ def test_views_that_err_alike_count_for_fewer():
 
 
 def test_what_is_refined_lies_midway_between_trained_and_lifted_and_is_as_long_as_the_trained():
-    trained, lifted = np.array([[3.0, 0], [0, 2], [0, 0]], np.float32), np.array([[0, 0.1], [0, 0], [1, 0]], np.float32)
-    np.testing.assert_allclose(start("both", lifted, trained), [[3 / 2**0.5] * 2, [0, 2], [0, 0]], rtol=1e-6)
+    trained, lifted = (
+        np.array([[3.0, 0], [0, 2], [0, 0]], np.float32),
+        np.array([[0, 0.1], [0, 0], [1, 0]], np.float32),
+    )
+    np.testing.assert_allclose(
+        start("both", lifted, trained), [[3 / 2**0.5] * 2, [0, 2], [0, 0]], rtol=1e-6
+    )
     assert start("trained", lifted, trained) is trained
     assert start("lifted", lifted, trained) is lifted and start("both", lifted, None) is lifted
 
 
 def test_the_blend_counts_knowledge_as_so_many_views():
-    f, g = np.array([[1.0, 0], [1, 0], [1, 0], [1, 0]]), np.array([[0, 1.0], [0, 1], [0, 0], [0, 1]])
+    f, g = (
+        np.array([[1.0, 0], [1, 0], [1, 0], [1, 0]]),
+        np.array([[0, 1.0], [0, 1], [0, 0], [0, 1]]),
+    )
     n = effective(np.array([6, 0, 2, 1]))
-    np.testing.assert_allclose(blend(f, n, g, 3.0), [[0.5, 0.5], [0, 1], [1, 0], [0.25, 0.75]], atol=1e-7)
+    np.testing.assert_allclose(
+        blend(f, n, g, 3.0), [[0.5, 0.5], [0, 1], [1, 0], [0.25, 0.75]], atol=1e-7
+    )
     np.testing.assert_array_equal(blend(f, n, g, 0.0), f)
     unsure = blend(f, n, 0.5 * g, 3.0)  # counts for 3 / 8 of a view
     np.testing.assert_allclose(unsure[3], [1 / 1.375, 0.5 * 0.375 / 1.375], atol=1e-7)
@@ -142,33 +184,42 @@ def test_views_of_a_scene_count_for_less_where_they_are_less_sure_of_labels_than
     labels = np.eye(3)
     sure, between = np.tile([1.0, 0, 0], (5, 1)), np.tile([1.0, 0.9, 0], (5, 1))
     assert familiar(sure, sure, labels) == familiar(sure, between, labels) == 1
-    shares = [1 / (1 + np.exp(-0.1 / np.hypot(1, 0.9) / 0.1)), 1.0]  # of two labels; the third is far from both
+    # of two labels; the third is far from both
+    shares = [1 / (1 + np.exp(-0.1 / np.hypot(1, 0.9) / 0.1)), 1.0]
     assert familiar(between, sure, labels) == pytest.approx((shares[0] / shares[1]) ** 6, rel=5e-3)
     assert familiar(sure[:0], sure[:0], labels) == familiar(0 * sure, sure, labels) == 1
     half_seen = np.where(np.arange(5)[:, None] < 2, between, 0)
-    assert familiar(half_seen, sure, labels) == familiar(between, sure, labels)  # whom none sees says nothing
+    # whom none sees says nothing
+    assert familiar(half_seen, sure, labels) == familiar(between, sure, labels)
 
 
 def test_confidence_grows_with_votes_that_agree_and_falls_where_they_do_not():
     f, n = np.tile([2.0, 0], (4, 1)), np.array([0, 1, 6, 6])
     alone = confidence(f, n, np.array([1, 1, 1, 0.5]))
     np.testing.assert_allclose(alone, [0, 1 / 2, 3 / 4, 1.5 / 4], atol=1e-6)
-    same, other = (confidence(f, n, np.ones(4), np.tile(g, (4, 1)), 2.0) for g in ([1.0, 0], [0, 1.0]))
+    same, other = (
+        confidence(f, n, np.ones(4), np.tile(g, (4, 1)), 2.0) for g in ([1.0, 0], [0, 1.0])
+    )
     np.testing.assert_allclose(same, [2 / 3, 3 / 4, 5 / 6, 5 / 6], atol=1e-6)
     assert (other[1:] < same[1:]).all()
-    doubted = confidence(f, n, np.ones(4), np.tile([0, 1.0], (4, 1)), 2.0, worth=0.0)  # shape alone is heard
+    # shape alone is heard
+    doubted = confidence(f, n, np.ones(4), np.tile([0, 1.0], (4, 1)), 2.0, worth=0.0)
     np.testing.assert_allclose(doubted, 2 / 3, atol=1e-6)
     nothing = confidence(f, n, np.ones(4), np.zeros((4, 2)), 2.0)
     np.testing.assert_allclose(nothing, [0, 1 / 2, 3 / 4, 3 / 4], atol=1e-6)
 
 
 def votes(n_views, spread, seed=0):
-    """Halves of a plane of 400 Gaussians of two materials, what is true of them, and their affinities."""
+    """Halves of a plane of 400 Gaussians of two materials, what is true of them, and their
+    affinities.
+    """
     rng = np.random.default_rng(seed)
     means = np.concatenate([rng.uniform(0, 1, (400, 2)), np.zeros((400, 1))], 1)
     second = means[:, 0] > 0.5
     truth = np.eye(4)[second.astype(int)]
-    halves = np.stack([unit(truth + spread / np.sqrt(n_views) * rng.normal(size=truth.shape)) for _ in "ab"])
+    halves = np.stack(
+        [unit(truth + spread / np.sqrt(n_views) * rng.normal(size=truth.shape)) for _ in "ab"]
+    )
     colors = np.where(second[:, None], 0.2, 0.8) * np.ones(3)
     near = affinities(means, np.tile([0.0, 0, 1], (400, 1)), colors)
     return halves.astype(np.float32), np.full((2, 400), n_views), truth, near
@@ -181,7 +232,8 @@ def test_calibration_smooths_where_votes_are_noisy_and_not_where_neighbours_diff
     assert found.strength == 0
     assert set(found.curve["on"]) == set(found.curve["off"]) == {0.0}
     rng = np.random.default_rng(3)
-    own = unit(rng.normal(size=(400, 4)))  # each Gaussian is something else, and all views agree on it
+    # each Gaussian is something else, and all views agree on it
+    own = unit(rng.normal(size=(400, 4)))
     assert not calibrate(np.stack([own, own]), n_views, near).smooth
 
 
@@ -189,7 +241,9 @@ def test_the_halves_agree_as_calibration_has_it():
     halves, n_views, _, near = votes(2, 1.0)
     n_views = n_views.copy()
     n_views[0, ::3] = 0  # of one half alone: not counted
-    assert halves_agree(halves, n_views) == pytest.approx(calibrate(halves, n_views, near).curve["off"][0.0])
+    assert halves_agree(halves, n_views) == pytest.approx(
+        calibrate(halves, n_views, near).curve["off"][0.0]
+    )
     assert halves_agree(halves[[0, 0]], n_views) == pytest.approx(1)
     assert halves_agree(halves, n_views * np.array([[1], [0]])) == 0
 
@@ -198,7 +252,8 @@ def test_calibration_trusts_knowledge_as_far_as_views_are_noisy():
     chosen = {}
     for spread in (0.02, 1.0):
         halves, n_views, truth, near = votes(2, spread)
-        wrong = np.where(np.arange(400)[:, None] % 10 == 0, np.eye(4)[3], truth)  # knowledge errs, too
+        # knowledge errs, too
+        wrong = np.where(np.arange(400)[:, None] % 10 == 0, np.eye(4)[3], truth)
         near = Affinities(near.neighbors, np.zeros_like(near.weights))
         found = calibrate(halves, n_views, near, wrong)
         assert set(found.curve["off"]) == set(STRENGTHS)
@@ -214,7 +269,9 @@ def test_calibration_treats_both_halves_alike_and_ignores_what_one_half_does_not
     turned = calibrate(halves[::-1], n_views[::-1], near, truth)
     there = calibrate(halves, n_views, near, truth)
     assert turned[:2] == there[:2]
-    np.testing.assert_allclose(list(turned.curve["on"].values()), list(there.curve["on"].values()), rtol=1e-12)
+    np.testing.assert_allclose(
+        list(turned.curve["on"].values()), list(there.curve["on"].values()), rtol=1e-12
+    )
     many = calibrate(halves, 100 * n_views, near, truth)  # agree wholly, and may err alike
     assert many.strength >= effective(np.array([400])).item() / 2 * reliable(halves, n_views).mean()
     none = calibrate(halves, n_views * np.array([[1], [0]]), near, truth)
@@ -228,8 +285,11 @@ def test_carrying_over_is_its_formula(scene):
     for i in range(100):
         d = np.linalg.norm(points - at[i], axis=1)
         nearest = np.argsort(d)[:3]
-        weights = np.maximum(np.abs(point_normals[nearest] @ facing[i]), 0.1) ** 2 / (d[nearest] ** 2 + 1e-4)
-        np.testing.assert_allclose(found[i], weights @ values[nearest] / weights.sum(), atol=1e-5)  # float32
+        weights = np.maximum(np.abs(point_normals[nearest] @ facing[i]), 0.1) ** 2 / (
+            d[nearest] ** 2 + 1e-4
+        )
+        # float32
+        np.testing.assert_allclose(found[i], weights @ values[nearest] / weights.sum(), atol=1e-5)
         assert distances[i] == pytest.approx(3 * d.min(), rel=1e-5)
 
 
@@ -250,7 +310,9 @@ def test_a_room_has_about_its_own_unit():
     for preset, seed in (("office", 100), ("room", 200), ("shuffled", 301)):
         soup = build(preset, seed).soup
         corners = soup.vertices[soup.triangles].astype(np.float64)
-        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        areas = np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+        )
         chosen = corners[rng.choice(len(areas), 5000, p=areas / areas.sum())]
         means = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), 5000), chosen)
         assert room_unit(40 * means) == pytest.approx(40, rel=0.25)

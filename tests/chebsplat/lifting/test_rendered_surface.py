@@ -39,7 +39,10 @@ def test_points_lie_on_the_plane_that_tilted_gaussians_tile(normal, unit):
     raw["log_scales"] += np.float32(np.log(unit))
     middle = unit * np.array([0.2, -0.1, 0.5])
     poses = np.stack(
-        [look_at(middle + unit * (1.2 * normal + offset), middle) for offset in ((0.5, 0.1, 0), (0, 0.6, 0.2))]
+        [
+            look_at(middle + unit * (1.2 * normal + offset), middle)
+            for offset in ((0.5, 0.1, 0), (0, 0.6, 0.2))
+        ]
     )
     found = surface(raw, poses, np.stack([K, K]), SIZE, unit)
     assert len(found.means) > 200
@@ -55,7 +58,8 @@ def test_a_plane_s_inverse_depth_is_linear_in_pixels():
     for mean, normal, plane in zip(means, normals, planes, strict=True):
         pixel = np.array([40.0, 30.0, 1.0])
         ray = np.linalg.inv(K) @ pixel
-        share = min(abs(normal @ mean) / (0.15 * np.linalg.norm(mean)), 1) ** 2  # the rest faces the camera
+        # the rest faces the camera
+        share = min(abs(normal @ mean) / (0.15 * np.linalg.norm(mean)), 1) ** 2
         inverse = share * (normal @ ray) / (normal @ mean) + (1 - share) / mean[2]
         assert plane @ pixel == pytest.approx(inverse, rel=1e-9)
 
@@ -80,7 +84,9 @@ def test_planes_in_view_have_the_gradient_of_what_they_are():
     along = torch.nn.functional.cosine_similarity(axes, means + pose[:3, :3].T @ pose[:3, 3])
     assert 5 < (along.abs() < GRAZING).sum() < 40
     slope = torch.randn(60, 3, generator=g).double()
-    gradients = [torch.autograd.grad((made * slope).sum(), (means, quats)) for made in (found, wanted)]
+    gradients = [
+        torch.autograd.grad((made * slope).sum(), (means, quats)) for made in (found, wanted)
+    ]
     for ours, plain in zip(*gradients, strict=True):
         torch.testing.assert_close(ours, plain, rtol=1e-9, atol=1e-9)
 
@@ -122,7 +128,10 @@ def test_points_of_swept_depth_lie_where_the_views_see_them(unit):
     found = swept_surface(depths, np.stack([K, K]), poses, unit)
     np.testing.assert_allclose(found.means[:, 2], 2 * unit, rtol=1e-5)
     width = 2 * SIZE[0] / K[0, 0] / 2  # of what a view sees, to either side
-    assert found.means[:, 0].min() < (0.1 - width) * unit and found.means[:, 0].max() > (0.4 + width) * unit
+    assert (
+        found.means[:, 0].min() < (0.1 - width) * unit
+        and found.means[:, 0].max() > (0.4 + width) * unit
+    )
     assert 100 < len(found.means) < 6 * width * width / EDGE_SWEPT**2
     left = found.means[:, 0] < -0.1 * unit
     np.testing.assert_allclose(found.eyes[left], 0, atol=1e-6 * unit)

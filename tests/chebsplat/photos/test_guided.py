@@ -1,4 +1,6 @@
-"""Matches along epipolar lines: those of a search by the same rules, true ones, none without a line."""
+"""Matches along epipolar lines: those of a search by the same rules, true ones, none without a
+line.
+"""
 
 import numpy as np
 import pytest
@@ -11,9 +13,14 @@ K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 
 
 def seen(shift, n=600, noise=6, seed=0):
-    """Two views of random points, half of them in one alone: pixels, descriptors, F and the true partners."""
+    """Two views of random points, half of them in one alone: pixels, descriptors, F and the true
+    partners.
+    """
     rng = np.random.default_rng(seed)
-    poses = poses_of(Rotation.from_rotvec([[0, 0, 0], [0.02, 0.05, 0.1]]).as_matrix(), np.array([[0.0, 0, 0], shift]))
+    poses = poses_of(
+        Rotation.from_rotvec([[0, 0, 0], [0.02, 0.05, 0.1]]).as_matrix(),
+        np.array([[0.0, 0, 0], shift]),
+    )
     points = rng.uniform([-1, -0.8, 3], [1, 0.8, 6], (n, 3))
     camera = [(points @ pose[:3, :3].T + pose[:3, 3]) @ K.T for pose in poses]
     first, second = ((at[:, :2] / at[:, 2:]).astype(np.float32) for at in camera)
@@ -38,7 +45,9 @@ def searched(pixels, descriptors, F):
     cosine = (one @ other.T) / np.outer(np.linalg.norm(one, axis=1), np.linalg.norm(other, axis=1))
     n, m = cosine.shape
     pairs = np.indices((n, m)).reshape(2, -1)
-    misses = sampson_distance(F, pixels[0][pairs[0]].astype(float), pixels[1][pairs[1]].astype(float))
+    misses = sampson_distance(
+        F, pixels[0][pairs[0]].astype(float), pixels[1][pairs[1]].astype(float)
+    )
     cosine = np.where(misses.reshape(n, m) <= BAND, cosine, -1)
     best, mutual = cosine.argmax(1), cosine.argmax(0)[cosine.argmax(1)] == np.arange(n)
     top = np.sort(cosine, 1)
@@ -46,7 +55,9 @@ def searched(pixels, descriptors, F):
     return np.stack([np.flatnonzero(fits), best[fits]], 1)
 
 
-@pytest.mark.parametrize("shift", [[0.5, 0, 0], [0, 0.5, 0], [0.1, 0.2, 0.6]], ids=["aside", "up", "ahead"])
+@pytest.mark.parametrize(
+    "shift", [[0.5, 0, 0], [0, 0.5, 0], [0.1, 0.2, 0.6]], ids=["aside", "up", "ahead"]
+)
 def test_matches_are_those_of_a_search_of_all_features_and_true(shift):
     pixels, descriptors, F, truth = seen(shift)
     (found,) = along_lines(pixels, descriptors, np.array([[0, 1]]), F[None])
@@ -65,7 +76,9 @@ def test_pairs_are_matched_each_by_itself_and_in_any_order():
 
 def test_lines_elsewhere_leave_few_matches():
     pixels, descriptors, F, truth = seen([0.5, 0, 0])
-    (found,) = along_lines((pixels[0], pixels[1] + np.float32([0, 25])), descriptors, np.array([[0, 1]]), F[None])
+    (found,) = along_lines(
+        (pixels[0], pixels[1] + np.float32([0, 25])), descriptors, np.array([[0, 1]]), F[None]
+    )
     assert len(found) < 0.05 * (truth >= 0).sum()
 
 

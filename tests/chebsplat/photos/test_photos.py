@@ -1,4 +1,6 @@
-"""Exposures that are undone before a training, depth that a capture brings, and disturbances for studies."""
+"""Exposures that are undone before a training, depth that a capture brings, and disturbances for
+studies.
+"""
 
 import chebsplat  # noqa: F401  # isort: skip
 import numpy as np
@@ -30,12 +32,19 @@ K = torch.tensor([[40.0, 0, 24], [0, 40, 20], [0, 0, 1]])
 
 
 def test_measured_exposures_are_those_the_photos_were_taken_with():
-    """In linear light, of a wall of many colours; and none is told where two photos share no points."""
+    """In linear light, of a wall of many colours; and none is told where two photos share no
+    points.
+    """
     g = np.random.default_rng(0)
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, 2, 3] = 5
-    points, image = g.normal(size=(2000, 3)), np.repeat(np.repeat(g.integers(90, 200, (5, 6, 3)), 8, 0), 8, 1)
-    stops = np.array([[-0.4, 0.1, 0], [0.2, 0.2, 0.2], [0, 0, 0], [0.1, -0.2, 0], [0.1, -0.1, -0.2]])
+    points, image = (
+        g.normal(size=(2000, 3)),
+        np.repeat(np.repeat(g.integers(90, 200, (5, 6, 3)), 8, 0), 8, 1),
+    )
+    stops = np.array(
+        [[-0.4, 0.1, 0], [0.2, 0.2, 0.2], [0, 0, 0], [0.1, -0.2, 0], [0.1, -0.1, -0.2]]
+    )
     images = np.stack([relit(image.astype(np.uint8), own) for own in stops])
     Ks = np.tile(K.double().numpy(), (5, 1, 1))
     assert measured_exposures(images, Ks, poses, points) == pytest.approx(stops, abs=0.02)
@@ -43,7 +52,9 @@ def test_measured_exposures_are_those_the_photos_were_taken_with():
     assert np.isnan(measured_exposures(images, Ks, poses, points, np.zeros((0, 2), int))).all()
     tracks = np.stack(np.meshgrid(np.arange(2000), np.arange(4)), -1).reshape(-1, 2)
     some = measured_exposures(images, Ks, poses, points, tracks)
-    assert np.isnan(some[4]).all() and some[:4] == pytest.approx(stops[:4] - stops[:4].mean(0), abs=0.02)
+    assert np.isnan(some[4]).all() and some[:4] == pytest.approx(
+        stops[:4] - stops[:4].mean(0), abs=0.02
+    )
 
 
 def test_a_photo_relit_and_back_is_the_same_but_for_what_was_cut_off():
@@ -58,20 +69,31 @@ def ring(n):
     """Cameras about the origin that look at it."""
     poses = np.tile(np.eye(4), (n, 1, 1))
     for k, angle in enumerate(np.linspace(0, 2 * np.pi, n, endpoint=False)):
-        poses[k, :3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        poses[k, :3, :3] = [
+            [np.cos(angle), 0, np.sin(angle)],
+            [0, 1, 0],
+            [-np.sin(angle), 0, np.cos(angle)],
+        ]
         poses[k, 2, 3] = 3
     return poses
 
 
 def test_exposures_that_drift_along_the_path_are_shared_and_those_of_single_photos_their_own():
-    g, poses, angle = np.random.default_rng(0), ring(40), np.linspace(0, 2 * np.pi, 40, endpoint=False)[:, None]
+    g, poses, angle = (
+        np.random.default_rng(0),
+        ring(40),
+        np.linspace(0, 2 * np.pi, 40, endpoint=False)[:, None],
+    )
     drift = 0.3 * np.sin(angle) * np.array([1, 0.9, 1.2])
     assert np.abs(own_part(drift, poses)).max() < 0.01
     noise = g.normal(size=(40, 1)) * 0.2 + g.normal(size=(40, 3)) * 0.02
     own = own_part(drift + noise, poses)
     assert (own - noise + noise.mean(0)).std() < 0.55 * noise.std()
     alone = np.full((40, 3), np.nan)
-    assert not own_part(alone, poses).any() and not own_part(np.zeros((40, 3)), np.tile(np.eye(4), (40, 1, 1))).any()
+    assert (
+        not own_part(alone, poses).any()
+        and not own_part(np.zeros((40, 3)), np.tile(np.eye(4), (40, 1, 1))).any()
+    )
     some = np.where(np.arange(40)[:, None] == 7, np.nan, drift + noise)
     assert not own_part(some, poses)[7].any() and own_part(some, poses)[8].any()
 
@@ -110,22 +132,38 @@ def test_depth_distance_counts_what_is_known_alone():
     inverse = torch.full((4, 4), 0.55, requires_grad=True)
     distance = depth_distance(inverse, torch.ones(4, 4, 1), truth, None)
     distance.backward()
-    assert distance.item() == pytest.approx(0.1) and not inverse.grad[0, :2].any() and (inverse.grad[1:] > 0).all()
+    assert (
+        distance.item() == pytest.approx(0.1)
+        and not inverse.grad[0, :2].any()
+        and (inverse.grad[1:] > 0).all()
+    )
     assert depth_distance(inverse, torch.ones(4, 4, 1), truth * float("nan"), None) == 0
 
 
 def test_gaussians_go_where_depth_is_measured():
-    """The same training with and without a depth a tenth beyond what the Gaussians show at first."""
+    """The same training with and without a depth a tenth beyond what the Gaussians show at
+    first.
+    """
 
     def distance(weight):
-        made = tiny_trainer(steps=60, densify="off", prune=False, depth_every=2, weight_depth=weight)
+        made = tiny_trainer(
+            steps=60, densify="off", prune=False, depth_every=2, weight_depth=weight
+        )
         with torch.no_grad():
-            shown = [made.model.render(made.views.camera(v, 1), 0, depth=True) for v in range(len(made.views.names))]
+            shown = [
+                made.model.render(made.views.camera(v, 1), 0, depth=True)
+                for v in range(len(made.views.names))
+            ]
         depths = [r.alpha[..., 0] / at_pixels(r.planes) for r in shown]
-        truths = [torch.where(r.alpha[..., 0] > 0.5, 1.1 * z, torch.nan) for r, z in zip(shown, depths, strict=True)]
+        truths = [
+            torch.where(r.alpha[..., 0] > 0.5, 1.1 * z, torch.nan)
+            for r, z in zip(shown, depths, strict=True)
+        ]
         made.views.depth = lambda index, factor: truths[index][::factor, ::factor]
         losses = list(made.steps())
-        assert ["loss_depth" in figures for figures in losses] == [step % 2 == 1 for step in range(60)]
+        assert ["loss_depth" in figures for figures in losses] == [
+            step % 2 == 1 for step in range(60)
+        ]
         with torch.no_grad():
             r = made.model.render(made.views.camera(0, 1), 0, depth=True)
             return float(depth_distance(at_pixels(r.planes), r.alpha, truths[0], None))
@@ -145,7 +183,8 @@ def test_the_depth_loss_is_on_where_views_tell_the_same_depth():
     points.depths = np.full((3, 20, 24), 5, np.float32)
     assert decided() == (DEPTH_WEIGHT, "")
     points.depths = None
-    capture.cam_from_world[1, 2, 3], capture.cam_from_world[2, 2, 3] = 5.5, 6.0  # each half a unit farther back
+    # each half a unit farther back
+    capture.cam_from_world[1, 2, 3], capture.cam_from_world[2, 2, 3] = 5.5, 6.0
     capture.depth = np.stack([np.full((40, 48), z, np.float32) for z in (5, 5.5, 6)])
     capture.depth[:, :3] = np.nan
     assert decided() == (DEPTH_WEIGHT, "")
@@ -160,8 +199,13 @@ def test_the_depth_loss_is_on_where_views_tell_the_same_depth():
 def test_a_colour_fit_undoes_an_affine_map():
     g = np.random.default_rng(1)
     truth = g.integers(60, 200, (20, 30, 3), np.uint8)
-    image = (truth @ np.array([[0.7, 0.1, 0], [0, 0.8, 0.1], [0.1, 0, 0.9]]) + 10).round().astype(np.uint8)
-    assert np.abs(color_fitted(image, truth).astype(int) - truth).max() <= 2  # of rounding to 8 bits, twice
+    image = (
+        (truth @ np.array([[0.7, 0.1, 0], [0, 0.8, 0.1], [0.1, 0, 0.9]]) + 10)
+        .round()
+        .astype(np.uint8)
+    )
+    # of rounding to 8 bits, twice
+    assert np.abs(color_fitted(image, truth).astype(int) - truth).max() <= 2
     assert color_fitted(np.full_like(truth, 7), truth).std() < 60  # one colour fits as a constant
 
 
@@ -173,7 +217,10 @@ def test_disturbances_leave_test_views_and_the_mean_alone():
     assert np.array_equal(changed[is_test], poses[is_test])
     motions = np.linalg.inv(poses[~is_test]) @ changed[~is_test]
     rotations = Rotation.from_matrix(motions[:, :3, :3])
-    assert np.abs(rotations.as_rotvec().mean(0)).max() < 1e-4 and np.abs(motions[:, :3, 3].mean(0)).max() < 1e-4
+    assert (
+        np.abs(rotations.as_rotvec().mean(0)).max() < 1e-4
+        and np.abs(motions[:, :3, 3].mean(0)).max() < 1e-4
+    )
     turns = np.degrees(rotations.magnitude())
     shifts = np.linalg.norm(centers(changed) - centers(poses), axis=1)[~is_test]
     assert 0.3 < turns.mean() < 0.7 and 0.005 < shifts.mean() < 0.015
@@ -192,7 +239,10 @@ def photographed(kind, gains):
     capture = Capture(names, images, Ks, poses, np.zeros(n, bool), source={"kind": kind})
     means = g.normal(size=(2000, 3))
     flat = np.zeros((2000, 3), np.float32)
-    colors, shapes = np.full((2000, 3), 100, np.uint8), np.tile(np.eye(3, dtype=np.float32), (2000, 1, 1))
+    colors, shapes = (
+        np.full((2000, 3), 100, np.uint8),
+        np.tile(np.eye(3, dtype=np.float32), (2000, 1, 1)),
+    )
     points = Points(names, Ks, poses, means, colors, flat, shapes, np.zeros((0, 2), np.int32))
     return capture, points
 
@@ -207,13 +257,15 @@ def photographed(kind, gains):
         ("colmap", [0.8, 1.4, 0.7, 1.2], "off", False, "train.exposure is off"),
     ],
 )
-def test_exposures_are_undone_where_photos_of_the_same_points_differ(tmp_path, kind, gains, chosen, wanted, why):
+def test_exposures_are_undone_where_photos_of_the_same_points_differ(
+    tmp_path, kind, gains, chosen, wanted, why
+):
     job = Job({}, config.build({"train": {"exposure": chosen}}, "test"), tmp_path, tmp_path)
     capture, points = photographed(kind, gains)
     trainer = assemble(job, Inputs(capture, points))
-    assert (trainer.settings.exposure == "measured") == wanted and why in job.facts.get("left_out", {}).get(
-        "exposure by photo", ""
-    )
+    assert (trainer.settings.exposure == "measured") == wanted and why in job.facts.get(
+        "left_out", {}
+    ).get("exposure by photo", "")
     assert ("exposure_stops" in job.facts) == (chosen != "off" and kind != "generated")
 
 

@@ -1,4 +1,6 @@
-"""What has no texture goes on as the planes that are known of it, and no patch goes on into another."""
+"""What has no texture goes on as the planes that are known of it, and no patch goes on into
+another.
+"""
 
 import numpy as np
 import pytest
@@ -10,7 +12,9 @@ HEIGHT, WIDTH = 48, 64
 
 @pytest.fixture
 def corner():
-    """Colours and depth of two walls that meet in the middle, of colours that differ little, before a floor."""
+    """Colours and depth of two walls that meet in the middle, of colours that differ little, before
+    a floor.
+    """
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(float)
     depth = np.where(x < WIDTH / 2, 1 / (0.2 + 0.004 * x), 1 / (0.2 + 0.004 * (WIDTH - x)))
     colors = np.where((x < WIDTH / 2)[..., None], [0.70, 0.70, 0.68], [0.64, 0.64, 0.62])
@@ -44,7 +48,8 @@ def test_slow_shades_do_not_bound_a_patch_and_edges_do(corner):
 def test_wrong_pixels_and_two_planes_of_one_colour_do_not_mislead(corner):
     colors, depth = corner
     rng = np.random.default_rng(1)
-    colors = np.where((colors[..., :1] > 0.6), 0.7, colors)  # both walls alike: one patch of two planes
+    # both walls alike: one patch of two planes
+    colors = np.where((colors[..., :1] > 0.6), 0.7, colors)
     given = holes(depth, rng, 0.4)
     wrong = (rng.random(depth.shape) < 0.15) & (given > 0)
     given[wrong] *= rng.uniform(0.6, 0.9, wrong.sum())

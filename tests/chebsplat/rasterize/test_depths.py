@@ -1,4 +1,6 @@
-"""Depth of the surface equals its transcription, and lies where most of a pixel's light comes from."""
+"""Depth of the surface equals its transcription, and lies where most of a pixel's light comes
+from.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ N, SIZE = 300, (83, 61)
 def arguments():
     gaussians = tuple(a.numpy() for a in scene(N, 1, 0)[:4])
     viewmats, K, *_ = camera(*SIZE)
-    planes = np.random.default_rng(0).normal((0, 0, 0.5), (1e-3, 1e-3, 0.1), (N, 3)).astype(np.float32)
+    planes = (
+        np.random.default_rng(0).normal((0, 0, 0.5), (1e-3, 1e-3, 0.1), (N, 3)).astype(np.float32)
+    )
     return gaussians, viewmats[0].numpy(), K[0].numpy(), SIZE, planes
 
 
@@ -49,7 +53,9 @@ def test_the_depth_is_the_same_bits_for_any_number_of_threads():
 def test_a_wall_of_faint_gaussians_is_met_where_they_are_densest():
     rng = np.random.default_rng(0)
     n, wall = 4000, 2.0
-    means = np.stack([*rng.uniform(-1.5, 1.5, (2, n)), wall - rng.exponential(0.05, n)], 1).astype(np.float32)
+    means = np.stack([*rng.uniform(-1.5, 1.5, (2, n)), wall - rng.exponential(0.05, n)], 1).astype(
+        np.float32
+    )
     gaussians = means, np.tile(np.float32([1, 0, 0, 0]), (n, 1)), np.full((n, 3), 0.05, np.float32)
     K = np.array([[60.0, 0, 30], [0, 60.0, 30], [0, 0, 1]])
     planes = np.zeros((n, 3), np.float32)

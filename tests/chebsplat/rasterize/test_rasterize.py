@@ -14,7 +14,9 @@ from chebsplat.splats.rotations import rotation_matrices
 
 
 def tiny_case():
-    """Arguments of `rasterize` for four Gaussians, float32, and the image [H, W, 4] that gsplat made of them."""
+    """Arguments of `rasterize` for four Gaussians, float32, and the image [H, W, 4] that gsplat
+    made of them.
+    """
     file = DATA / "raster_reference/tiny_case.safetensors"
     if not file.exists():
         pytest.skip("raster_reference is missing")
@@ -26,7 +28,13 @@ def tiny_case():
     K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     directions = case["means"] - torch.tensor([0.123, 0.456, -8.0])
     colors = sh.eval_sh(case["coeffs"][:, :1], case["coeffs"][:, 1:], directions, 3)
-    gaussians = (case["means"], case["quats"], case["scales"].exp(), case["opacities"].sigmoid(), colors)
+    gaussians = (
+        case["means"],
+        case["quats"],
+        case["scales"].exp(),
+        case["opacities"].sigmoid(),
+        colors,
+    )
     return (*gaussians, viewmat[None], K[None], width, height), case["out_img"]
 
 
@@ -50,7 +58,9 @@ def test_harmonics_are_orthonormal():
     z, weights = np.polynomial.legendre.leggauss(n)
     phi = (np.arange(2 * n) + 0.5) * np.pi / n
     r = np.sqrt(1 - z**2)[:, None]
-    grid = np.stack([r * np.cos(phi), r * np.sin(phi), np.broadcast_to(z[:, None], (n, 2 * n))], -1).reshape(-1, 3)
+    grid = np.stack(
+        [r * np.cos(phi), r * np.sin(phi), np.broadcast_to(z[:, None], (n, 2 * n))], -1
+    ).reshape(-1, 3)
     values = sh.basis(torch.from_numpy(grid), 3).numpy()
     area = np.repeat(weights, 2 * n) * np.pi / n
     np.testing.assert_allclose(values.T @ (values * area[:, None]), np.eye(16), atol=1e-12)

@@ -1,4 +1,6 @@
-"""The numba backend equals the plain-torch oracle, in value and gradient, and never depends on thread count."""
+"""The numba backend equals the plain-torch oracle, in value and gradient, and never depends on
+thread count.
+"""
 
 import pytest
 import torch
@@ -33,7 +35,9 @@ def test_float64_is_refused_by_the_cpu_backend_and_taken_by_auto():
 def test_a_gradient_to_a_camera_is_refused_not_dropped():
     viewmats, K, width, height = camera()
     with pytest.raises(ValueError, match="cameras no gradient"):
-        rasterize(*scene(channels=3), viewmats.requires_grad_(True), K, width, height, backend="cpu")
+        rasterize(
+            *scene(channels=3), viewmats.requires_grad_(True), K, width, height, backend="cpu"
+        )
 
 
 def test_two_trainings_side_by_side_get_what_each_gets_alone():
@@ -54,7 +58,11 @@ def test_two_trainings_side_by_side_get_what_each_gets_alone():
         worker.join()
     for seed in (0, 1):
         assert len(together[seed]) == 20
-        assert all(torch.equal(a, b) for found in together[seed] for a, b in zip(found, alone[seed], strict=True))
+        assert all(
+            torch.equal(a, b)
+            for found in together[seed]
+            for a, b in zip(found, alone[seed], strict=True)
+        )
 
 
 def _gradients_elsewhere(_):

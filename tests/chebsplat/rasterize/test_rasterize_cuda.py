@@ -1,4 +1,6 @@
-"""The cuda backend asks gsplat for what the others do, says what is missing, and renders as they do."""
+"""The cuda backend asks gsplat for what the others do, says what is missing, and renders as they
+do.
+"""
 
 import sys
 import types
@@ -35,11 +37,15 @@ def asked(monkeypatch):
 
 
 def render(arguments, **options):
-    return rasterize(arguments[0].as_subclass(OnGpu), *arguments[1:], *camera(), max_alpha=CEILING, **options)
+    return rasterize(
+        arguments[0].as_subclass(OnGpu), *arguments[1:], *camera(), max_alpha=CEILING, **options
+    )
 
 
 def test_gsplat_takes_cell_colors_as_channels_on_black(asked):
-    image, _, meta = render(scene(channels=3), backgrounds=torch.ones(1, 3), cell_colors=torch.rand(150, 5))
+    image, _, meta = render(
+        scene(channels=3), backgrounds=torch.ones(1, 3), cell_colors=torch.rand(150, 5)
+    )
     assert asked["channel_chunk"] >= 8 and asked["backgrounds"].tolist() == [[1.0] * 3 + [0.0] * 5]
     assert image.shape[-1] == 3 and meta["cells"].shape == (1, 10, 14, 5)
 
@@ -58,7 +64,9 @@ def test_gsplat_never_sees_a_broken_gaussian(field, asked):
     assert all(torch.isfinite(a).all() for a in (means, quats, scales, opacities, colors))
     assert opacities[3] == 0 and (opacities > 0).sum() == 149
     others = torch.arange(150) != 3
-    assert torch.equal(means[others], arguments[0][others]) and torch.equal(colors[others], arguments[4][others])
+    assert torch.equal(means[others], arguments[0][others]) and torch.equal(
+        colors[others], arguments[4][others]
+    )
 
 
 def test_long_quaternions_do_not_overflow(asked):
@@ -91,16 +99,20 @@ def test_random_scenes_are_as_on_the_cpu(channels, mode, background):
     weights[undecided(arguments, 53, 37, 2, rasterize_mode=mode, max_alpha=CEILING)] = 0
     a = gradients(arguments, torch.float32, "cpu", weights, backgrounds=backgrounds, **options)
     on_gpu = backgrounds.cuda() if background else None
-    b = gradients(arguments, torch.float32, "cuda", weights, device="cuda", backgrounds=on_gpu, **options)
+    b = gradients(
+        arguments, torch.float32, "cuda", weights, device="cuda", backgrounds=on_gpu, **options
+    )
     decided = (weights != 0).all(-1)
-    # gsplat's exponential is approximate (2 units in the last place at best), and its covariance float32 throughout
+    # gsplat's exponential is approximate (2 units in the last place at best), and its covariance
+    # float32 throughout
     for x, y in zip(a[:2], b[:2], strict=True):
         assert (x - y.cpu())[decided].abs().max() < 1e-4
     for name, x, y in zip((*NAMES, "means2d"), a[2], b[2], strict=True):
         assert (x - y.cpu()).norm() < 1e-3 * x.norm(), name
     absolute = [m["means2d"].absgrad.cpu() for m in (a[3], b[3])]
     assert (absolute[0] - absolute[1]).norm() < 1e-3 * absolute[0].norm()
-    assert ((a[3]["radii"] > 0) | (b[3]["radii"].cpu() == 0)).all()  # gsplat's box is the tighter one
+    # gsplat's box is the tighter one
+    assert ((a[3]["radii"] > 0) | (b[3]["radii"].cpu() == 0)).all()
 
 
 @pytest.mark.gpu

@@ -1,7 +1,8 @@
-"""Every backend equals float64, in value and gradient: channel counts, ragged edges, modes, extreme inputs.
+"""Every backend equals float64, in value and gradient: channel counts, ragged edges, modes, extreme
+inputs.
 
-Pixels where float32 may round an alpha across a limit (1/255, the ceiling, the stop) are left out: there a whole
-contribution comes or goes, whoever is right. They are found in float64, and few.
+Pixels where float32 may round an alpha across a limit (1/255, the ceiling, the stop) are left out:
+there a whole contribution comes or goes, whoever is right. They are found in float64, and few.
 """
 
 import pytest
@@ -11,7 +12,8 @@ from raster import NAMES, brute_force, camera, gradients, scene, undecided
 from chebsplat.rasterize import rasterize
 
 IMAGE = 1e-6  # at worst, of values in [0, 1]
-MEANS = 2e-6  # the same under a pixel: a mean at 50 is rounded by up to 2e-6, and alpha changes by 0.9 a pixel
+# the same under a pixel: a mean at 50 is rounded by up to 2e-6, and alpha changes by 0.9 a pixel
+MEANS = 2e-6
 GRADIENT = 1e-4  # relative, of each tensor's norm and of its largest entry
 ORACLE = 1e-10
 
@@ -65,7 +67,9 @@ def test_any_channels_and_edges_are_exact(channels, size):
 
 
 @pytest.mark.parametrize("n", [1, 5, 16, 33])
-@pytest.mark.parametrize("size", [(53, 37), (32, 16), (17, 1), (3, 2)], ids=lambda size: f"{size[0]}x{size[1]}")
+@pytest.mark.parametrize(
+    "size", [(53, 37), (32, 16), (17, 1), (3, 2)], ids=lambda size: f"{size[0]}x{size[1]}"
+)
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_cell_colors_are_means_over_cells_of_what_colors_would_be(backend, size, n):
     arguments, generator = scene(channels=3), torch.Generator().manual_seed(1)
@@ -86,7 +90,9 @@ def test_cell_colors_are_means_over_cells_of_what_colors_would_be(backend, size,
 
     def by_pixel(leaves, *camera):
         image = rasterize(*leaves[:4], torch.cat(leaves[4:], 1), *camera, backend="reference")[0][0]
-        return image[..., :3], torch.stack([image[y : y + 4, x : x + 4, 3:].mean((0, 1)) for y, x in corners])
+        return image[..., :3], torch.stack(
+            [image[y : y + 4, x : x + 4, 3:].mean((0, 1)) for y, x in corners]
+        )
 
     def by_cell(leaves, *camera):
         image, _, meta = rasterize(*leaves[:5], *camera, backend=backend, cell_colors=leaves[5])
@@ -107,8 +113,12 @@ def test_a_gaussian_with_a_broken_cell_color_is_not_drawn():
     gone = [torch.cat([a[:7], a[8:]]) for a in (*arguments, in_cells)]
     viewmats, K, width, height = camera()
     for backend in ("reference", "cpu"):
-        broken = rasterize(*arguments, viewmats, K, width, height, backend=backend, cell_colors=in_cells)
-        without = rasterize(*gone[:5], viewmats, K, width, height, backend=backend, cell_colors=gone[5])
+        broken = rasterize(
+            *arguments, viewmats, K, width, height, backend=backend, cell_colors=in_cells
+        )
+        without = rasterize(
+            *gone[:5], viewmats, K, width, height, backend=backend, cell_colors=gone[5]
+        )
         torch.testing.assert_close(broken[0], without[0])
         torch.testing.assert_close(broken[2]["cells"], without[2]["cells"])
 
@@ -116,13 +126,17 @@ def test_a_gaussian_with_a_broken_cell_color_is_not_drawn():
 def test_a_non_finite_gradient_of_the_cells_is_an_error():
     arguments = [a.requires_grad_(True) for a in scene(channels=3)]
     viewmats, K, width, height = camera()
-    _, _, meta = rasterize(*arguments, viewmats, K, width, height, backend="cpu", cell_colors=arguments[4].detach())
+    _, _, meta = rasterize(
+        *arguments, viewmats, K, width, height, backend="cpu", cell_colors=arguments[4].detach()
+    )
     with pytest.raises(ValueError, match="view 0 is not finite"):
         (meta["cells"] * torch.inf).sum().backward()
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
-@pytest.mark.parametrize("size", [0.02, 0.2, 1.0], ids=["less than a pixel", "about a pixel", "pixels"])
+@pytest.mark.parametrize(
+    "size", [0.02, 0.2, 1.0], ids=["less than a pixel", "about a pixel", "pixels"]
+)
 def test_each_mode_is_exact_at_any_size_of_gaussians(mode, size):
     arguments = scene(channels=3)
     arguments[2] *= size
@@ -135,7 +149,9 @@ def test_several_views_and_backgrounds_are_exact():
     weights, decided = loss_weights(arguments, 37, 23, 2)
     background = torch.tensor([[0.1, 0.2, 0.3, 0.4], [0.9, 0.8, 0.7, 0.6]])
     found = gradients(arguments, torch.float32, "cpu", weights, backgrounds=background)
-    oracle = gradients(arguments, torch.float64, "reference", weights, backgrounds=background.double())
+    oracle = gradients(
+        arguments, torch.float64, "reference", weights, backgrounds=background.double()
+    )
     assert_agree(found, oracle, decided, IMAGE, GRADIENT)
 
 
@@ -158,7 +174,9 @@ def test_several_views_in_one_call_equal_separate_calls(backend):
         assert torch.equal(alone[2]["radii"][0], together[2]["radii"][c])
         alone[0].square().sum().backward()
     for name, a, found in zip(NAMES, arguments[:4], gradient, strict=False):
-        torch.testing.assert_close(found, a.grad, rtol=1e-4, atol=1e-6 * float(a.grad.abs().max()), msg=name)
+        torch.testing.assert_close(
+            found, a.grad, rtol=1e-4, atol=1e-6 * float(a.grad.abs().max()), msg=name
+        )
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
@@ -170,17 +188,27 @@ def test_absolute_gradient_is_the_sum_over_pixels(mode):
         for x in range(17):
             one = torch.zeros_like(weights)
             one[0, y, x] = weights[0, y, x]
-            expected += gradients(arguments, torch.float64, "reference", one, rasterize_mode=mode)[2][5].abs()
-    for backend, dtype, error in (("reference", torch.float64, ORACLE), ("cpu", torch.float32, GRADIENT)):
+            expected += gradients(arguments, torch.float64, "reference", one, rasterize_mode=mode)[
+                2
+            ][5].abs()
+    for backend, dtype, error in (
+        ("reference", torch.float64, ORACLE),
+        ("cpu", torch.float32, GRADIENT),
+    ):
         *_, meta = gradients(arguments, dtype, backend, weights, rasterize_mode=mode, absgrad=True)
         assert (meta["means2d"].absgrad - expected).abs().max() <= error * expected.max()
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_a_gaussian_outside_reaches_in_as_far_as_it_shows(backend):
-    # its mean is 3.1 to 3.3 σ beyond the middle of the last pixels, and a wider image of the same camera cannot cull it
+    # its mean is 3.1 to 3.3 σ beyond the middle of the last pixels, and a wider image of the same
+    # camera cannot cull it
     K = torch.tensor([[[160.0, 0, 200], [0, 160, 10], [0, 0, 1]]])
-    arguments = [torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.1)]
+    arguments = [
+        torch.tensor([[0.0, 0, 2]]),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 3), 0.1),
+    ]
     arguments += [torch.tensor([0.99]), torch.ones(1, 1)]
     for reach in (3.1, 3.2, 3.3):
         slope = 1.5
@@ -189,7 +217,8 @@ def test_a_gaussian_outside_reaches_in_as_far_as_it_shows(backend):
             slope = (399.5 + reach * sigma - 200) / 160
         arguments[0][0, 0] = 2 * slope
         narrow, wide = (
-            rasterize(*arguments, torch.eye(4)[None], K, width, 20, backend=backend)[0] for width in (400, 600)
+            rasterize(*arguments, torch.eye(4)[None], K, width, 20, backend=backend)[0]
+            for width in (400, 600)
         )
         assert narrow.max() > 1 / 255
         torch.testing.assert_close(narrow, wide[:, :, :400], rtol=1e-4, atol=1e-6)
@@ -207,7 +236,9 @@ def put(field, value, culled=False):
 
 def pile(arguments):
     """Eight nearly opaque layers before the camera: compositing stops within."""
-    arguments[0][:8] = torch.tensor([[0.02, 0.01, 1.0]]) + torch.arange(8)[:, None] * torch.tensor([0, 0, 0.1])
+    arguments[0][:8] = torch.tensor([[0.02, 0.01, 1.0]]) + torch.arange(8)[:, None] * torch.tensor(
+        [0, 0, 0.1]
+    )
     arguments[2][:8], arguments[3][:8] = 0.5, 0.95
 
 
@@ -256,19 +287,29 @@ def test_extreme_input_is_exact(name, backend, mode):
     if culled:
         others = torch.arange(150) != 3
         width, height = found[0].shape[2], found[0].shape[1]
-        weights, _ = loss_weights([a[others] for a in arguments], width, height, rasterize_mode=mode)
+        weights, _ = loss_weights(
+            [a[others] for a in arguments], width, height, rasterize_mode=mode
+        )
         dtype = torch.float64 if backend == "reference" else torch.float32
-        without = gradients([a[others] for a in arguments], dtype, backend, weights, rasterize_mode=mode)
+        without = gradients(
+            [a[others] for a in arguments], dtype, backend, weights, rasterize_mode=mode
+        )
         assert torch.equal(found[0], without[0]) and torch.equal(found[1], without[1])
         assert all((g[3] == 0).all() for g in [*grads[:5], grads[5][0]])
-        assert name not in ("behind the camera", "zero quaternion", "nan mean") or meta["radii"][0, 3] == 0
+        assert (
+            name not in ("behind the camera", "zero quaternion", "nan mean")
+            or meta["radii"][0, 3] == 0
+        )
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 def test_needle_has_exact_gradients_of_its_own(backend):
     # by itself: beside others its gradients would hide in their norm
     arguments = [a[:1] for a in scene(channels=3)]
-    arguments[0], arguments[2] = torch.tensor([[0.05, 0.02, 1.5]]), torch.tensor([[1e3, 1e-9, 1e-9]])
+    arguments[0], arguments[2] = (
+        torch.tensor([[0.05, 0.02, 1.5]]),
+        torch.tensor([[1e3, 1e-9, 1e-9]]),
+    )
     check(arguments, backend=backend)
 
 
@@ -286,10 +327,17 @@ def test_compensation_has_exact_gradients_of_its_own(shape, backend):
 @pytest.mark.parametrize("size", [0.0, 1e-6, 1e-3])
 def test_compensation_ends_at_its_floor_and_has_no_gradient_there(size, backend):
     viewmats, K, width, height = camera(9, 9)
-    arguments = [torch.tensor([[0.0, 0, 2]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), size)]
-    arguments = [a.requires_grad_(True) for a in (*arguments, torch.tensor([0.9]), torch.ones(1, 1))]
+    arguments = [
+        torch.tensor([[0.0, 0, 2]]),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 3), size),
+    ]
+    arguments = [
+        a.requires_grad_(True) for a in (*arguments, torch.tensor([0.9]), torch.ones(1, 1))
+    ]
     options = {"rasterize_mode": "antialiased", "backend": backend}
-    alpha = rasterize(*arguments, viewmats, K, width, height, **options)[1][0, 4, 4, 0]  # the mean's own pixel
+    # the mean's own pixel
+    alpha = rasterize(*arguments, viewmats, K, width, height, **options)[1][0, 4, 4, 0]
     torch.testing.assert_close(alpha.detach(), torch.tensor(0.9 * 0.005))
     alpha.backward()
     torch.testing.assert_close(arguments[3].grad, torch.tensor([0.005]))
@@ -299,7 +347,10 @@ def test_compensation_ends_at_its_floor_and_has_no_gradient_there(size, backend)
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize("n", [0, 5])
 def test_nothing_in_view_is_the_background_with_zero_gradients(n, backend):
-    arguments, dtype = [a[:n] for a in scene(channels=3)], torch.float64 if backend == "reference" else torch.float32
+    arguments, dtype = (
+        [a[:n] for a in scene(channels=3)],
+        torch.float64 if backend == "reference" else torch.float32,
+    )
     arguments[0][:, 2] = -1
     background = torch.tensor([[0.25, 0.5, 0.75]], dtype=dtype, requires_grad=True)
     weights = torch.ones(1, 37, 53, 3)

@@ -1,7 +1,7 @@
 """The rasterizer's memory is bounded by what it draws, and does not grow with use.
 
-Measured in a process of its own, this file with a function's name: the kernel keeps the peak of the resident set, and
-writing 5 to /proc/self/clear_refs starts it anew.
+Measured in a process of its own, this file with a function's name: the kernel keeps the peak of the
+resident set, and writing 5 to /proc/self/clear_refs starts it anew.
 """
 
 import json
@@ -36,7 +36,9 @@ def iterate(arguments, view, gradients):
 
 
 def peak():
-    """Growth of one forward and backward pass over its bound: 64 bytes a pair of a Gaussian and a tile, and images."""
+    """Growth of one forward and backward pass over its bound: 64 bytes a pair of a Gaussian and a
+    tile, and images.
+    """
     from benchmarks.raster import camera, scene
 
     view = viewmats, Ks, width, height = camera()
@@ -71,7 +73,9 @@ def drift():
 def measured(name):
     environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "65536", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, __file__, name]
-    return json.loads(subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE).stdout)
+    return json.loads(
+        subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE).stdout
+    )
 
 
 def test_peak_is_64_bytes_a_pair_and_the_images():
@@ -79,7 +83,8 @@ def test_peak_is_64_bytes_a_pair_and_the_images():
 
 
 def test_ten_thousand_iterations_leak_nothing():
-    assert measured("drift") < 1 << 20  # over 9,000 of them: a leak of 120 bytes an iteration would show
+    # over 9,000 of them: a leak of 120 bytes an iteration would show
+    assert measured("drift") < 1 << 20
 
 
 if __name__ == "__main__":

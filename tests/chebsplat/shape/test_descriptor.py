@@ -1,4 +1,5 @@
-"""Every descriptor ignores pose, size, order and signs; the compiled one agrees with float64 and never wavers.
+"""Every descriptor ignores pose, size, order and signs; the compiled one agrees with float64 and
+never wavers.
 
 Extreme regions are cases of the stability suite, against 60 digits.
 """
@@ -38,7 +39,12 @@ every_route = pytest.mark.parametrize("route", ROUTES)
 
 
 @every_route
-@given(seed=st.integers(0, 10**6), power=st.floats(-6, 6), n=st.integers(20, 64), mirrored=st.booleans())
+@given(
+    seed=st.integers(0, 10**6),
+    power=st.floats(-6, 6),
+    n=st.integers(20, 64),
+    mirrored=st.booleans(),
+)
 @settings(max_examples=25, deadline=None, derandomize=True)
 def test_motion_size_and_mirror_do_not_matter(route, seed, power, n, mirrored):
     means, scales, rotmats, mask = region(n, seed, 2)
@@ -51,7 +57,8 @@ def test_motion_size_and_mirror_do_not_matter(route, seed, power, n, mirrored):
 
 
 @every_route
-@pytest.mark.parametrize("name", [None, "coincident", "far pairs"])  # in two nearly all eigenvalues meet
+# in two nearly all eigenvalues meet
+@pytest.mark.parametrize("name", [None, "coincident", "far pairs"])
 def test_order_does_not_matter(route, name):
     means, scales, rotmats, mask = extreme(name) if name else region(32)
     p = torch.randperm(means.shape[1], generator=torch.Generator().manual_seed(0))
@@ -92,12 +99,18 @@ def test_recurrence_equals_the_eigendecomposition(degree):
     root = weights.sum(1).rsqrt()
     S = root[:, None] * weights * root
     values, vectors = torch.linalg.eigh(-S)
-    terms = [((d * values.clamp(-1, 1).arccos()).cos() * vectors**2).sum(1) for d in range(2, degree + 1)]
-    expected = torch.stack(terms, -1) - torch.tensor([(1, 0, -1, 0)[d % 4] for d in range(2, degree + 1)])
+    terms = [
+        ((d * values.clamp(-1, 1).arccos()).cos() * vectors**2).sum(1) for d in range(2, degree + 1)
+    ]
+    expected = torch.stack(terms, -1) - torch.tensor(
+        [(1, 0, -1, 0)[d % 4] for d in range(2, degree + 1)]
+    )
     assert (chebyshev_diagonals(S, degree) - expected).abs().max() <= 1e-12 * expected.abs().max()
 
 
-@pytest.mark.parametrize(("n", "n_angles", "max_degree"), [(64, 4, 8), (33, 1, 2), (17, 3, 7), (100, 5, 13), (5, 2, 3)])
+@pytest.mark.parametrize(
+    ("n", "n_angles", "max_degree"), [(64, 4, 8), (33, 1, 2), (17, 3, 7), (100, 5, 13), (5, 2, 3)]
+)
 def test_compiled_descriptor_agrees_with_float64(n, n_angles, max_degree):
     sizes = {"n_angles": n_angles, "max_degree": max_degree}
     found = errors(*(described(route, region(n, 1, 16), **sizes) for route in ("compiled", "full")))
@@ -108,10 +121,13 @@ def test_compiled_descriptor_agrees_with_float64(n, n_angles, max_degree):
 @pytest.mark.parametrize("bandwidth", [1e-6, 1e-2, 0.1, 1e6])
 @pytest.mark.parametrize("name", REGIONS)
 def test_extreme_region_at_extreme_bandwidth_agrees_with_float64(name, bandwidth):
-    found, exact = (described(route, extreme(name), bandwidth=bandwidth) for route in ("compiled", "full"))
+    found, exact = (
+        described(route, extreme(name), bandwidth=bandwidth) for route in ("compiled", "full")
+    )
     assert torch.isfinite(found).all()
-    # At 1e-6 logarithms of weights reach 1e12 and float64 rounds them by 1e-4: where edges are equally long, that is
-    # the error of the oracle, too. At 0.1 those of edges that count reach 100, and float32 rounds them by 1e-5.
+    # At 1e-6 logarithms of weights reach 1e12 and float64 rounds them by 1e-4: where edges are
+    # equally long, that is the error of the oracle, too. At 0.1 those of edges that count reach
+    # 100, and float32 rounds them by 1e-5.
     equal = any(word in name for word in ("lattice", "ring", "round"))
     limit = {1e-6: 20 * WORST if equal else WORST, 0.1: 2 * WORST}.get(bandwidth, WORST)
     assert errors(found, exact).max() <= limit
@@ -135,13 +151,17 @@ def test_gathered_members_are_described_like_their_regions():
     assert error <= 1e-6 * wanted.values.abs().max()  # float32, the rounding of the rotations
 
 
-@pytest.mark.parametrize("bad", [{"bandwidth": 0.0}, {"n_angles": 0}, {"max_degree": 1}, {"anisotropy": -1.0}])
+@pytest.mark.parametrize(
+    "bad", [{"bandwidth": 0.0}, {"n_angles": 0}, {"max_degree": 1}, {"anisotropy": -1.0}]
+)
 def test_senseless_parameters_are_refused(bad):
     with pytest.raises(ValueError, match="needed"):
         described("compiled", region(), **bad)
 
 
-@pytest.mark.parametrize("beyond", [{"dtype": torch.float64}, {"gradient": True}, {"backend": "cuda"}])
+@pytest.mark.parametrize(
+    "beyond", [{"dtype": torch.float64}, {"gradient": True}, {"backend": "cuda"}]
+)
 def test_a_backend_refuses_what_it_does_not_compute(beyond):
     means, *rest = region(4)
     means = means.clone().requires_grad_(beyond.pop("gradient", False))

@@ -1,4 +1,6 @@
-"""Lessons are sums: exact without their points, in any order, and gone without a trace when they are forgotten."""
+"""Lessons are sums: exact without their points, in any order, and gone without a trace when they
+are forgotten.
+"""
 
 import math
 
@@ -26,7 +28,9 @@ P, D = 9, 4
 
 
 def points(seed, n=200, kinds=P):
-    """z [n, P] of features of the first `kinds`, the last always 1; y of one map for all, with noise; w."""
+    """z [n, P] of features of the first `kinds`, the last always 1; y of one map for all, with
+    noise; w.
+    """
     rng = np.random.default_rng(seed)
     z = rng.normal(size=(n, P)) * (np.arange(P) < kinds)
     z[:, -1] = 1
@@ -48,13 +52,17 @@ def test_sums_answer_as_the_points_do():
     z, y, w = points(0)
     sums, w1 = summed(z, y, w), w / w.sum()
     root = np.sqrt(w)[:, None]
-    np.testing.assert_allclose(solved(sums, 1e-14), np.linalg.lstsq(root * z, root * y)[0], rtol=1e-9)
+    np.testing.assert_allclose(
+        solved(sums, 1e-14), np.linalg.lstsq(root * z, root * y)[0], rtol=1e-9
+    )
     for ridge in (1e-3, 0.1):
         A = (w1[:, None] * z).T @ z
         wanted = np.linalg.inv(A + ridge * np.diag(np.diag(A))) @ (w1[:, None] * z).T @ y
         np.testing.assert_allclose(solved(sums, ridge), wanted, rtol=1e-10)
     mean = (w1[:, None] * y).sum(0)
-    assert sums.spread() == pytest.approx(math.sqrt((w1 * ((y - mean) ** 2).sum(1)).sum()), rel=1e-10)
+    assert sums.spread() == pytest.approx(
+        math.sqrt((w1 * ((y - mean) ** 2).sum(1)).sum()), rel=1e-10
+    )
     for weights in (0 * w, np.zeros(0)):
         with pytest.raises(ValueError, match="no point has a weight"):
             summed(z[: len(weights)], y[: len(weights)], weights)

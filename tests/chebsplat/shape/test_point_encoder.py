@@ -1,4 +1,6 @@
-"""The point encoder sees shape alone: whichever way a room stands, in whatever unit, and however dense its points."""
+"""The point encoder sees shape alone: whichever way a room stands, in whatever unit, and however
+dense its points.
+"""
 
 import numpy as np
 import pytest
@@ -49,12 +51,16 @@ def encoder(seen):
 
 def test_a_shorter_series_tells_shapes_apart_less_as_a_longer_one_does():
     means, _, covariances = corner()
-    lost = [truncation(means, covariances, up=UP, describe=DescribeSection(max_degree=d)) for d in (2, 8)]
+    lost = [
+        truncation(means, covariances, up=UP, describe=DescribeSection(max_degree=d))
+        for d in (2, 8)
+    ]
     assert 0 <= lost[1] < lost[0] < 1
     turned = truncation(10 * means + 5, 100 * covariances, up=UP, unit=10.0)
     assert turned == pytest.approx(lost[1], abs=1e-3)  # of a scene in decimetres
     assert truncation(means[:2], covariances[:2], up=UP) is None
-    line = np.arange(40.0)[:, None] * [[100, 0, 0]]  # no point has another near it: nothing to tell apart
+    # no point has another near it: nothing to tell apart
+    line = np.arange(40.0)[:, None] * [[100, 0, 0]]
     assert truncation(line, np.tile(np.eye(3), (40, 1, 1)), up=UP) is None
 
 
@@ -84,23 +90,32 @@ def test_neighbours_lie_within_reach_and_far_ones_are_seen_at_large_radii(seen):
         assert distance[rows >= 0].max() <= REACH * radius * (1 + 1e-5)
     rows = seen.neighbors[:, 2]
     far = np.linalg.norm(seen.means[rows] - seen.means[:, None], axis=-1) * (rows >= 0)
-    assert np.median(far.max(1)) > 0.5 * RADII[2]  # 24 neighbours reach as far as the radius, not as the spacing
+    # 24 neighbours reach as far as the radius, not as the spacing
+    assert np.median(far.max(1)) > 0.5 * RADII[2]
 
 
 def attended(scale, tokens):
-    """Textbook attention of the learned token to itself and to neighbours' tokens [K, h], in NumPy: [2 h]."""
+    """Textbook attention of the learned token to itself and to neighbours' tokens [K, h], in NumPy:
+    [2 h].
+    """
     w = {name: value.detach().double().numpy() for name, value in scale.state_dict().items()}
 
     def normal(rows, name):
         less = rows - rows.mean(-1, keepdims=True)
-        return less / np.sqrt((less**2).mean(-1, keepdims=True) + 1e-5) * w[f"{name}.weight"] + w[f"{name}.bias"]
+        return (
+            less / np.sqrt((less**2).mean(-1, keepdims=True) + 1e-5) * w[f"{name}.weight"]
+            + w[f"{name}.bias"]
+        )
 
     def fed(rows):
         hidden = normal(rows, "norm_after") @ w["feed.0.weight"].T + w["feed.0.bias"]
         return rows + (hidden / (1 + np.exp(-hidden))) @ w["feed.2.weight"].T + w["feed.2.bias"]
 
     rows = normal(np.vstack([w["token"], tokens]), "norm")
-    q, k, v = ((rows @ w[f"{name}.weight"].T).reshape(len(rows), N_HEADS, -1) for name in ("query", "key", "value"))
+    q, k, v = (
+        (rows @ w[f"{name}.weight"].T).reshape(len(rows), N_HEADS, -1)
+        for name in ("query", "key", "value")
+    )
     scores = np.exp(np.einsum("hd,khd->kh", q[0], k) / np.sqrt(q.shape[2]))
     heads = np.einsum("kh,khd->hd", scores / scores.sum(0), v).ravel()
     mean = fed(tokens).mean(0) if len(tokens) else np.zeros(len(w["token"]))
@@ -108,10 +123,14 @@ def attended(scale, tokens):
 
 
 def test_features_are_the_written_formula(seen, encoder):
-    """In float64, neighbour by neighbour; of a point whose neighbours are whole, masked in the midst, or none."""
+    """In float64, neighbour by neighbour; of a point whose neighbours are whole, masked in the
+    midst, or none.
+    """
     point, double = 17, PointEncoder(**encoder.settings).double()
     double.load_state_dict(encoder.state_dict())
-    cloud = point_encoder.Cloud(*(v.double() if v.is_floating_point() else v for v in cloud_of(seen)))
+    cloud = point_encoder.Cloud(
+        *(v.double() if v.is_floating_point() else v for v in cloud_of(seen))
+    )
     embedded = double.embedded(cloud.own, cloud.descriptors)
     for missing in ([], [0, 3, 4], range(seen.neighbors.shape[2])):
         neighbors = cloud.neighbors[[point]].clone()
@@ -123,9 +142,21 @@ def test_features_are_the_written_formula(seen, encoder):
                 o = (cloud.means[j] - cloud.means[point]) / radius
                 n, m = cloud.normals[point], cloud.normals[j]
                 along = o @ n
-                lengths = [o.norm(), o[:2].norm(), o[2].abs(), along, (o - along * n).norm(), n @ m, m[2] - n[2]]
+                lengths = [
+                    o.norm(),
+                    o[:2].norm(),
+                    o[2].abs(),
+                    along,
+                    (o - along * n).norm(),
+                    n @ m,
+                    m[2] - n[2],
+                ]
                 between = torch.cat([o, torch.stack(lengths)])
-                token = scale.point(embedded[point]) + scale.neighbor(embedded[j]) + scale.place(between)
+                token = (
+                    scale.point(embedded[point])
+                    + scale.neighbor(embedded[j])
+                    + scale.place(between)
+                )
                 tokens.append(token.detach().numpy())
             stacked = np.array(tokens).reshape(len(tokens), encoder.settings["hidden"])
             parts.append(torch.from_numpy(attended(scale, stacked)))
@@ -140,7 +171,9 @@ def test_features_are_the_written_formula(seen, encoder):
 def test_a_point_without_neighbours_and_coincident_points_have_finite_answers(encoder):
     for means in (np.zeros((1, 3)), np.zeros((40, 3)), np.array([[0.0, 0, 0], [1e4, 0, 0]])):
         n = len(means)
-        inputs = point_inputs(means, np.tile(UP, (n, 1)), np.tile(1e-4 * np.eye(3), (n, 1, 1)), up=UP)
+        inputs = point_inputs(
+            means, np.tile(UP, (n, 1)), np.tile(1e-4 * np.eye(3), (n, 1, 1)), up=UP
+        )
         features = encoder.encode(inputs)
         assert features.shape == (n, encoder.n_features)
         assert np.isfinite(features).all()
@@ -149,7 +182,9 @@ def test_a_point_without_neighbours_and_coincident_points_have_finite_answers(en
 
 
 def test_it_learns_what_shape_tells(seen):
-    """Floor, wall and box top have a vector each; taught on one room, the encoder knows them in another."""
+    """Floor, wall and box top have a vector each; taught on one room, the encoder knows them in
+    another.
+    """
     codes = np.eye(5, dtype=np.float32)[:3]
 
     def example(seed):

@@ -66,7 +66,8 @@ def test_members_are_spread_over_the_ball():
     regions = regions_of(points, DescribeSection(n_regions=40, region_size=32))
     offsets = np.linalg.norm(points[regions.members] - points[regions.centers][:, None], axis=-1)
     offsets = np.where(regions.members >= 0, offsets, np.nan)
-    assert np.median(np.nanmax(offsets, axis=1)) > 0.7 * regions.radius  # thinned: not a speck of nearest ones
+    # thinned: not a speck of nearest ones
+    assert np.median(np.nanmax(offsets, axis=1)) > 0.7 * regions.radius
     assert (regions.members >= 0).sum(1).min() > 4
 
 

@@ -1,4 +1,6 @@
-"""What hangs together: parts are connected by touching, numbered by size, and only crumbs are left out."""
+"""What hangs together: parts are connected by touching, numbered by size, and only crumbs are left
+out.
+"""
 
 import numpy as np
 

@@ -9,11 +9,15 @@ from chebsplat.training.sh_prune import dense, masked_sh
 
 
 def scene(held=(60, 60, 60, 60)):
-    """Coefficients by band of the first held[l] of 60 Gaussians, and nested masks of the 40 in view."""
+    """Coefficients by band of the first held[l] of 60 Gaussians, and nested masks of the 40 in
+    view.
+    """
     g = torch.Generator().manual_seed(0)
     index = torch.randperm(60, generator=g)[:40]
     masks = (torch.arange(3) < torch.randint(0, 4, (40, 1), generator=g)).float()
-    parameters = [torch.randn(n, 2 * band + 1, 3, generator=g) for band, n in enumerate(held)] + [masks]
+    parameters = [torch.randn(n, 2 * band + 1, 3, generator=g) for band, n in enumerate(held)] + [
+        masks
+    ]
     return parameters, index, torch.randn(60, 3, generator=g), torch.randn(3, generator=g)
 
 
@@ -47,7 +51,8 @@ def test_a_colour_cut_off_at_black_is_lifted_and_never_lowered(value, backend):
     assert colors.abs().max() < 1e-7
     (colors * torch.tensor([[-1.0], [1.0]])).sum().backward()
     torch.testing.assert_close(sh0.grad[0], torch.full((1, 3), -0.28209479177387814))
-    assert value == 0 or not sh0.grad[1].any()  # rounding decides on which side of 0 the other one is
+    # rounding decides on which side of 0 the other one is
+    assert value == 0 or not sh0.grad[1].any()
 
 
 def test_a_mask_that_no_longer_learns_gets_no_gradient_and_changes_none_of_the_others():

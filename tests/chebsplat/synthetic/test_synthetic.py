@@ -50,7 +50,8 @@ def test_depth_of_one_view_predicts_another(toy):
         z, u, v = projected(points, toy["Ks"][b], toy["cam_from_world"][b])
         height, width = toy["depth"][b].shape
         inside = (z > 0.1) & (u >= 0.5) & (u < width - 0.5) & (v >= 0.5) & (v < height - 0.5)
-        seen = 1 / bilinear(1 / toy["depth"][b], u[inside] - 0.5, v[inside] - 0.5)  # 1/z of a plane is linear
+        # 1/z of a plane is linear
+        seen = 1 / bilinear(1 / toy["depth"][b], u[inside] - 0.5, v[inside] - 0.5)
         relative.append(np.abs(seen - z[inside]) / z[inside])
         n_compared += inside.sum()
     assert n_compared > 0.4 * 3 * toy["depth"][0].size
@@ -65,7 +66,10 @@ def projected(points, K, pose):
 
 
 def bilinear(image, x, y):
-    i, j = np.minimum(y.astype(int), image.shape[0] - 2), np.minimum(x.astype(int), image.shape[1] - 2)
+    i, j = (
+        np.minimum(y.astype(int), image.shape[0] - 2),
+        np.minimum(x.astype(int), image.shape[1] - 2),
+    )
     s, t = y - i, x - j
     above = (1 - t) * image[i, j] + t * image[i, j + 1]
     return (1 - s) * above + s * ((1 - t) * image[i + 1, j] + t * image[i + 1, j + 1])
@@ -121,14 +125,23 @@ def test_furniture_stays_in_the_room_and_pieces_do_not_intersect(preset, seed):
 def part_box(soup, part):
     """(class, centre, axes, half extents) of the box around a part."""
     chosen = soup.parts == part
-    local = (soup.vertices[np.unique(soup.triangles[chosen])] - soup.origins[part]) @ soup.rotations[part].T
+    local = (
+        soup.vertices[np.unique(soup.triangles[chosen])] - soup.origins[part]
+    ) @ soup.rotations[part].T
     low, high = local.min(0), local.max(0)
     axes = soup.rotations[part]
-    return CLASS_NAMES[soup.labels[chosen][0]], soup.origins[part] + (low + high) / 2 @ axes, axes, (high - low) / 2
+    return (
+        CLASS_NAMES[soup.labels[chosen][0]],
+        soup.origins[part] + (low + high) / 2 @ axes,
+        axes,
+        (high - low) / 2,
+    )
 
 
 def overlap(first, second):
-    """Depth in metres by which two boxes intersect, by separating axes; not positive if they are apart."""
+    """Depth in metres by which two boxes intersect, by separating axes; not positive if they are
+    apart.
+    """
     (_, ca, A, ha), (_, cb, B, hb) = first, second
     offset = cb - ca
     if np.linalg.norm(offset) > np.linalg.norm(ha) + np.linalg.norm(hb):
@@ -141,15 +154,22 @@ def overlap(first, second):
 
 @pytest.fixture(scope="module", params=SCENES, ids=lambda scene: f"{scene[0]}-{scene[1]}")
 def small(request):
-    """(preset, depth [V, h, w], labels, K, poses) of a scene at a third of its size, without colours."""
+    """(preset, depth [V, h, w], labels, K, poses) of a scene at a third of its size, without
+    colours.
+    """
     preset, seed = request.param
     n_views, width, height = generated.SIZES[preset]
     if preset != "toy":
         width, height = 108, 81
     room, K = build(preset, seed), intrinsics(width, height)
-    poses, caster = walk(room.size, n_views, seed), RayCaster(room.soup.vertices, room.soup.triangles)
+    poses, caster = (
+        walk(room.size, n_views, seed),
+        RayCaster(room.soup.vertices, room.soup.triangles),
+    )
     y, x = np.mgrid[:height, :width] + 0.5
-    hits = [generated.trace(caster, K, pose, np.stack([x.ravel(), y.ravel()], 1))[0] for pose in poses]
+    hits = [
+        generated.trace(caster, K, pose, np.stack([x.ravel(), y.ravel()], 1))[0] for pose in poses
+    ]
     depth = np.stack([hit.distance for hit in hits]).reshape(n_views, height, width)
     labels = np.stack([room.soup.labels[hit.triangle] for hit in hits]).reshape(depth.shape)
     return preset, depth, labels, K, poses
@@ -158,7 +178,8 @@ def small(request):
 def test_every_class_is_seen_and_no_view_is_blank(small):
     preset, _, labels, _, _ = small
     counts = np.bincount(labels.ravel(), minlength=len(CLASS_NAMES))
-    n_seen = {"toy": 7, "shuffled": 15}.get(preset, len(CLASS_NAMES))  # what is shuffled need not hold everything
+    # what is shuffled need not hold everything
+    n_seen = {"toy": 7, "shuffled": 15}.get(preset, len(CLASS_NAMES))
     assert (counts > 50).sum() >= n_seen, dict(zip(CLASS_NAMES, counts.tolist(), strict=True))
     for view in labels:
         assert np.bincount(view.ravel()).max() < 0.9 * view.size
@@ -171,22 +192,30 @@ def test_what_a_test_view_shows_two_training_views_show_too(small):
     for test in range(0, len(poses), 8):
         pixels = np.random.default_rng(test).integers(0, depth.shape[1:], (300, 2))
         points = unproject(depth[test], K, poses[test], pixels)
-        n_seen = sum(is_seen(points, depth[k], K, poses[k]).astype(int) for k in range(len(poses)) if k % 8)
+        n_seen = sum(
+            is_seen(points, depth[k], K, poses[k]).astype(int) for k in range(len(poses)) if k % 8
+        )
         covered.append((n_seen >= 2).mean())
-    mean, worst = (0.94, 0.9) if preset == "toy" else (0.985, 0.95)  # under a table some floor is hidden
+    # under a table some floor is hidden
+    mean, worst = (0.94, 0.9) if preset == "toy" else (0.985, 0.95)
     assert np.mean(covered) > mean
     assert min(covered) > worst
 
 
 def is_seen(points, depth, K, pose):
-    """Points [N, 3] that a view shows: some pixel within one of the projection has their depth, to 2 %."""
+    """Points [N, 3] that a view shows: some pixel within one of the projection has their depth, to
+    2 %.
+    """
     z, u, v = projected(points, K, pose)
     height, width = depth.shape
     inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     near = np.full(len(points), np.inf)
     for i in (-1, 0, 1):
         for j in (-1, 0, 1):
-            row, column = np.clip(v.astype(int) + i, 0, height - 1), np.clip(u.astype(int) + j, 0, width - 1)
+            row, column = (
+                np.clip(v.astype(int) + i, 0, height - 1),
+                np.clip(u.astype(int) + j, 0, width - 1),
+            )
             near = np.minimum(near, np.abs(depth[row, column] - z))
     return inside & (near < 0.02 * z)
 
@@ -196,7 +225,10 @@ def test_glossy_surfaces_change_with_the_eye():
     one, up = np.ones(1, np.float32), np.float32([[0, 0, 1]])
     eyes = [np.float32([[0, 0, 1]]), np.float32([[0.8, 0, 0.6]])]
     free = lambda start, offset: np.zeros(len(start), bool)  # noqa: E731
-    a, b = (shade(np.zeros((1, 3), np.float32), up, eye, np.ones((1, 3)), one, 30 * one, lights, free) for eye in eyes)
+    a, b = (
+        shade(np.zeros((1, 3), np.float32), up, eye, np.ones((1, 3)), one, 30 * one, lights, free)
+        for eye in eyes
+    )
     assert a.mean() > 1.1 * b.mean()
 
 

@@ -29,7 +29,9 @@ def seeded(seed=0):
 
 def grow(parameters, members, gradient, budget=50, threshold=1e-4, seed=0, **options):
     candidates = densify.Candidates(**options)
-    return densify.densify(parameters, members, gradient, threshold, budget, seeded(seed), candidates)
+    return densify.densify(
+        parameters, members, gradient, threshold, budget, seeded(seed), candidates
+    )
 
 
 # masks
@@ -60,7 +62,9 @@ def test_semantic_gate_starts_open_and_alike_and_can_learn():
 
 
 def test_a_gradient_that_is_nan_outside_a_region_does_not_reach_it():
-    found = densify.region_gradients(torch.tensor([torch.nan, 2.0]), torch.tensor([[1, -1], [0, 1]]))
+    found = densify.region_gradients(
+        torch.tensor([torch.nan, 2.0]), torch.tensor([[1, -1], [0, 1]])
+    )
     assert found[0] == 2
     assert densify.region_gradients(torch.zeros(0), torch.full((1, 3), -1)).tolist() == [0.0]
     assert len(grow(raw(), torch.arange(16)[None], found[1:]).parents) == 0
@@ -84,7 +88,9 @@ def test_additions_keep_their_promises(n, n_regions, budget, log_size, flat, bou
     members = torch.randint(-1, n, (n_regions, 12), generator=seeded(seed))
     gradient = 1e-3 * torch.rand(n_regions, generator=seeded(seed + 1))
     nearest, farthest = bounds
-    found = grow(parameters, members, gradient, budget, 2e-4, seed, nearest=nearest, farthest=farthest)
+    found = grow(
+        parameters, members, gradient, budget, 2e-4, seed, nearest=nearest, farthest=farthest
+    )
     count = len(found.parents)
     assert count <= budget
     assert set(found.rows) == set(parameters)
@@ -96,7 +102,11 @@ def test_additions_keep_their_promises(n, n_regions, budget, log_size, flat, bou
     new, old = found.rows["means"].double(), parameters["means"].double()
     distance, _ = torch.cdist(new, old, compute_mode="donot_use_mm_for_euclid_dist").min(1)
     assert torch.allclose(distance, (new - old[found.parents]).norm(dim=1), rtol=1e-3)
-    three = torch.cdist(old, old, compute_mode="donot_use_mm_for_euclid_dist").topk(4, largest=False).values[:, 1:]
+    three = (
+        torch.cdist(old, old, compute_mode="donot_use_mm_for_euclid_dist")
+        .topk(4, largest=False)
+        .values[:, 1:]
+    )
     spacing = three.mean(1)
     assert (distance >= 0.99 * nearest * spacing.min()).all()
     assert (distance <= 1.01 * farthest * spacing.max()).all()
@@ -121,7 +131,12 @@ def test_new_gaussians_keep_apart_from_each_other():
     new = found.rows["means"].double()
     assert len(new) > 30
     gaps = torch.cdist(new, new) + torch.eye(len(new))
-    three = torch.cdist(parameters["means"], parameters["means"]).topk(4, largest=False).values[:, 1:].mean(1)
+    three = (
+        torch.cdist(parameters["means"], parameters["means"])
+        .topk(4, largest=False)
+        .values[:, 1:]
+        .mean(1)
+    )
     spacing = three[members].median(1).values
     assert gaps.min() >= 0.5 * 0.9 * spacing.min()
 
@@ -152,7 +167,9 @@ def test_densify_is_fixed_by_its_generator_and_leaves_its_input_alone():
     members, gradient = torch.arange(200).reshape(5, 40), torch.ones(5)
     a, b, c = (grow(parameters, members, gradient, seed=s) for s in (3, 3, 4))
     assert torch.equal(a.rows["means"], b.rows["means"])
-    assert a.rows["means"].shape != c.rows["means"].shape or not torch.equal(a.rows["means"], c.rows["means"])
+    assert a.rows["means"].shape != c.rows["means"].shape or not torch.equal(
+        a.rows["means"], c.rows["means"]
+    )
     assert all(torch.equal(value, before[name]) for name, value in parameters.items())
 
 
@@ -206,7 +223,9 @@ def test_opacity_at_the_old_centre_stays_whatever_the_offset():
         shared = densify.shared_opacity(logits, log_scales, quats, offsets).sigmoid()
         local = torch.einsum("nji,nj->ni", rotation_matrices(quats), offsets) / log_scales.exp()
         falloff = torch.exp(-0.5 * (local**2).sum(1))
-        assert torch.allclose(1 - (1 - shared) * (1 - falloff * shared), logits.sigmoid(), atol=1e-6)
+        assert torch.allclose(
+            1 - (1 - shared) * (1 - falloff * shared), logits.sigmoid(), atol=1e-6
+        )
     in_place = densify.shared_opacity(logits, log_scales, quats, 0 * offsets).sigmoid()
     assert torch.allclose(in_place, 1 - (1 - logits.sigmoid()).sqrt())
 
@@ -214,7 +233,9 @@ def test_opacity_at_the_old_centre_stays_whatever_the_offset():
 def test_scales_shrink_only_along_the_offset_and_keep_the_second_moment():
     log_scales = torch.tensor([[0.0, 0.0, -2.0]], dtype=torch.float64)
     quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
-    shared = densify.shared_scales(log_scales, quats, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)).exp()
+    shared = densify.shared_scales(
+        log_scales, quats, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64)
+    ).exp()
     assert shared[0, 0] ** 2 + 0.25 == pytest.approx(1.0)
     assert shared[0, 1:].tolist() == pytest.approx([1.0, math.exp(-2)])
 
@@ -261,13 +282,16 @@ def test_clone_keeps_and_split_shrinks():
 
 
 def test_halves_of_splits_are_drawn_from_the_gaussian_that_is_split():
-    parameters = {name: value[:1].expand(20_000, *value.shape[1:]).clone() for name, value in raw().items()}
+    parameters = {
+        name: value[:1].expand(20_000, *value.shape[1:]).clone() for name, value in raw().items()
+    }
     parameters["log_scales"][:] = torch.tensor([-1.0, -2.0, -3.0])
     found = densify.clone_or_split(parameters, torch.ones(20_000), 0.5, 0.01, 20_000, seeded())
     frame = rotation_matrices(parameters["quats"][:1])[0]
     for means in (found.rows["means"], found.changed["means"]):
         local = (means - parameters["means"]) @ frame
-        assert torch.allclose(local.std(0), torch.tensor([-1.0, -2.0, -3.0]).exp(), rtol=0.03)  # 1/√(2N) = 0.5 %
+        # 1/√(2N) = 0.5 %
+        assert torch.allclose(local.std(0), torch.tensor([-1.0, -2.0, -3.0]).exp(), rtol=0.03)
 
 
 def test_classic_takes_the_steepest_within_budget():
@@ -324,7 +348,9 @@ def test_rows_can_come_and_go_before_the_first_step_and_down_to_none():
     for value in parameters.values():
         value.requires_grad_(True)
     optimizer = torch.optim.Adam([{"params": [v], "name": k} for k, v in parameters.items()])
-    optimizer_rows.extend_optimizer(optimizer, parameters, {k: v.detach()[:2] for k, v in parameters.items()})
+    optimizer_rows.extend_optimizer(
+        optimizer, parameters, {k: v.detach()[:2] for k, v in parameters.items()}
+    )
     optimizer_rows.prune_optimizer(optimizer, parameters, torch.zeros(6, dtype=torch.bool))
     assert all(len(v) == 0 and v.requires_grad for v in parameters.values())
 
@@ -332,8 +358,13 @@ def test_rows_can_come_and_go_before_the_first_step_and_down_to_none():
 def test_selecting_what_was_appended_gives_it_back():
     parameters, more = raw(5), raw(3, seed=1)
     both = optimizer_rows.append(parameters, more)
-    first, last = optimizer_rows.select(both, torch.arange(8) < 5), optimizer_rows.select(both, torch.arange(5, 8))
-    assert all(torch.equal(first[k], parameters[k]) and torch.equal(last[k], more[k]) for k in parameters)
+    first, last = (
+        optimizer_rows.select(both, torch.arange(8) < 5),
+        optimizer_rows.select(both, torch.arange(5, 8)),
+    )
+    assert all(
+        torch.equal(first[k], parameters[k]) and torch.equal(last[k], more[k]) for k in parameters
+    )
     with pytest.raises(ValueError, match="do not fit"):
         optimizer_rows.append(parameters, {"means": more["means"]})
 

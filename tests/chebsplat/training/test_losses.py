@@ -1,4 +1,6 @@
-"""Losses equal their plain-torch definitions, in value and gradient, and masked pixels do not exist."""
+"""Losses equal their plain-torch definitions, in value and gradient, and masked pixels do not
+exist.
+"""
 
 import numpy as np
 import pytest
@@ -78,7 +80,9 @@ def test_feature_distance_is_zero_for_the_pooled_render_and_ignores_masked_pixel
         assert feature_distance(render, pooled, mask, kind).item() < 1e-6
 
 
-@pytest.mark.parametrize(("size", "cells"), [((24, 32), (6, 8)), ((25, 30), (6, 7)), ((9, 11), (9, 11))])
+@pytest.mark.parametrize(
+    ("size", "cells"), [((24, 32), (6, 8)), ((25, 30), (6, 7)), ((9, 11), (9, 11))]
+)
 @pytest.mark.parametrize("counted", ["all alike", "some", "more or less"])
 @pytest.mark.parametrize("kind", ["length", "l1"])
 def test_fused_feature_distance_equals_the_oracle(size, cells, counted, kind):
@@ -87,7 +91,10 @@ def test_fused_feature_distance_equals_the_oracle(size, cells, counted, kind):
     amounts = (torch.rand(size, generator=g) - 0.4).clamp_min(0)
     mask = {"all alike": None, "some": amounts > 0, "more or less": amounts}[counted]
     a, b = render.clone().requires_grad_(True), render.double().requires_grad_(True)
-    value, exact = feature_distance(a, target, mask, kind), feature_distance_reference(b, target.double(), mask, kind)
+    value, exact = (
+        feature_distance(a, target, mask, kind),
+        feature_distance_reference(b, target.double(), mask, kind),
+    )
     (3 * value).backward()
     (3 * exact).backward()
     assert abs(value.item() - exact.item()) < 1e-6

@@ -1,4 +1,6 @@
-"""The printed method in the trainer: each part takes part, and each row of Table 5 leaves out one thing."""
+"""The printed method in the trainer: each part takes part, and each row of Table 5 leaves out one
+thing.
+"""
 
 import chebsplat  # noqa: F401  # isort: skip
 import numpy as np
@@ -24,7 +26,8 @@ def test_every_loss_and_every_module_takes_part():
     before = tiny_trainer(**SHORT).model.printed.state_dict()
     after = made.model.printed.state_dict()
     still = {name for name in before if torch.equal(before[name], after[name])}
-    assert {name.partition(".")[0] for name in still} <= {"modulation", "in_view"}  # there is no basis yet
+    # there is no basis yet
+    assert {name.partition(".")[0] for name in still} <= {"modulation", "in_view"}
 
 
 def test_masks_teach_the_features_that_guide_them():
@@ -34,11 +37,15 @@ def test_masks_teach_the_features_that_guide_them():
     rendered = made.model.render(made.views.camera(0, 1), 3)
     for loss in (rendered.auxiliary.soft_mask.sum(), rendered.auxiliary.delta.sum()):
         features = made.model.raw["features"]
-        assert torch.autograd.grad(loss, features, retain_graph=True, allow_unused=True)[0] is not None
+        assert (
+            torch.autograd.grad(loss, features, retain_graph=True, allow_unused=True)[0] is not None
+        )
     assert len(rendered.auxiliary.soft_mask) == len(rendered.auxiliary.delta) == len(made.model)
 
 
-@pytest.mark.parametrize("without", ["descriptor", "transformer", "pruning guidance", "SH guidance", "densification"])
+@pytest.mark.parametrize(
+    "without", ["descriptor", "transformer", "pruning guidance", "SH guidance", "densification"]
+)
 def test_a_row_of_table_5_leaves_out_one_thing(without):
     made, _ = trained(without=without)
     parts = made.model.printed
@@ -79,7 +86,12 @@ def test_what_is_stored_is_fused_and_closed_bands_are_gone():
             linear.weight.zero_()
             linear.weight[0, made.model.raw["features"].shape[1]] = 1.0
     is_open = made.model._open()
-    assert not is_open[::2, 0].any() and is_open[1::2, 0].all() and is_open[:, 3].all() and not is_open[:, 2].any()
+    assert (
+        not is_open[::2, 0].any()
+        and is_open[1::2, 0].all()
+        and is_open[:, 3].all()
+        and not is_open[:, 2].any()
+    )
     own = made.model.raw["features"].detach().clone()
     stored = made.finish()
     assert (stored["degrees"] == 3).all()  # bands are not nested
@@ -100,7 +112,9 @@ def test_knowledge_of_a_scene_pulls_the_next_and_grows():
     figures = list(second.steps())
     assert figures[0]["loss_knowledge"] > 0
     grown = second.model.grown_bases()
-    assert all(torch.equal(grown[name][:, : basis.shape[1]], basis) for name, basis in bases.items())
+    assert all(
+        torch.equal(grown[name][:, : basis.shape[1]], basis) for name, basis in bases.items()
+    )
 
 
 def test_a_resumed_training_ends_as_an_uninterrupted_one():

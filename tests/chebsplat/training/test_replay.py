@@ -25,7 +25,9 @@ def test_recordings_that_nobody_needs_are_gone_and_so_are_their_leaves(refused, 
 
     for key in ("coarse", "coarse", "fine", "fine"):
         call(key, leaf)
-    assert len(replay.recordings) == 4 and all(one.graph is not None for one in replay.recordings.values())
+    assert len(replay.recordings) == 4 and all(
+        one.graph is not None for one in replay.recordings.values()
+    )
     gone, leaf = weakref.ref(leaf), torch.ones(3, requires_grad=True)
     call("finer", leaf)  # no step is coarse, or as fine as before, again
     call("finer", leaf)

@@ -40,7 +40,13 @@ def test_label_entropy_is_its_formula():
     for i in range(4):
         for j in range(6):
             if labels.classes[i, j] >= 0:
-                mean = render[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].reshape(-1, C).mean(0).detach().numpy()
+                mean = (
+                    render[2 * i : 2 * i + 2, 2 * j : 2 * j + 2]
+                    .reshape(-1, C)
+                    .mean(0)
+                    .detach()
+                    .numpy()
+                )
                 logits = labels.class_codes.double().numpy() @ mean / 0.3
                 likelihood = math.exp(logits[labels.classes[i, j]]) / np.exp(logits).sum()
                 total -= float(labels.confidence[i, j].double()) * math.log(likelihood)
@@ -49,7 +55,9 @@ def test_label_entropy_is_its_formula():
 
 def test_its_gradient_agrees_with_finite_differences():
     render, labels = view()
-    assert torch.autograd.gradcheck(lambda r: label_entropy(r, labels, None, 0.5), render, rtol=1e-5, atol=1e-8)
+    assert torch.autograd.gradcheck(
+        lambda r: label_entropy(r, labels, None, 0.5), render, rtol=1e-5, atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("kind", ["cross-entropy", "length", "l1", None])
@@ -78,18 +86,28 @@ def test_where_every_cell_has_a_label_distances_are_as_without():
     render, labels = view(torch.float32)
     every = labels._replace(classes=labels.classes.clamp_min(0))
     features, settings = torch.randn(4, 6, C), TrainSection()
-    assert torch.equal(*(semantic_loss(render, features, given, None, settings) for given in (every, None)))
+    assert torch.equal(
+        *(semantic_loss(render, features, given, None, settings) for given in (every, None))
+    )
 
 
 def stored(kind, with_labels=True):
     values = np.zeros((1, 2, 2, C), np.float16)
-    labels = (np.zeros((1, 2, 2), np.int16), np.ones((1, 2, 2), np.float16)) if with_labels else (None, None)
-    return Features(["a"], values, ["wall"], np.eye(1, C, dtype=np.float32), *labels, convention={"kind": kind})
+    labels = (
+        (np.zeros((1, 2, 2), np.int16), np.ones((1, 2, 2), np.float16))
+        if with_labels
+        else (None, None)
+    )
+    return Features(
+        ["a"], values, ["wall"], np.eye(1, C, dtype=np.float32), *labels, convention={"kind": kind}
+    )
 
 
 def decided(train, features):
     """The section resolved for these features."""
-    capture = SimpleNamespace(names=["a"], is_test=np.zeros(1, bool), size=(1, 1), depth=None, cam_from_world=None)
+    capture = SimpleNamespace(
+        names=["a"], is_test=np.zeros(1, bool), size=(1, 1), depth=None, cam_from_world=None
+    )
     points = SimpleNamespace(names=["a"], notes={}, depths=None)
     return resolved(train, evidence_of(train, capture, points, features))
 
@@ -116,7 +134,10 @@ def test_ignored_pixels_of_the_labels_teacher_are_zero_not_noise():
 def test_a_training_of_labels_runs_to_a_finite_end():
     views = four_views()
     g = torch.Generator().manual_seed(0)
-    index, codes = torch.randint(-1, L, (10, 12), generator=g), torch.randn(L, CHANNELS, generator=g)
+    index, codes = (
+        torch.randint(-1, L, (10, 12), generator=g),
+        torch.randn(L, CHANNELS, generator=g),
+    )
     confidence = torch.rand(10, 12, generator=g)
     views.labels = lambda _: TaughtLabels(index, confidence, codes)
     trainer = tiny_trainer(views=views, feature_loss="cross-entropy")

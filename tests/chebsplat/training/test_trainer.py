@@ -27,7 +27,9 @@ def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays():
         next(steps)
     raw = made.model.raw
     with torch.no_grad():
-        raw["sh_logits"].copy_(torch.randn(raw["sh_logits"].shape, generator=torch.Generator().manual_seed(3)) * 6)
+        raw["sh_logits"].copy_(
+            torch.randn(raw["sh_logits"].shape, generator=torch.Generator().manual_seed(3)) * 6
+        )
     degrees = sh_prune.degrees(sh_prune.band_mask(raw["sh_logits"].detach()))
     moments = {name: dict(made.optimizer.state[value]) for name, value in raw.items()}
     before, means = made.model.render(made.views.camera(0, 1), 3).rgb, raw["means"].detach().clone()
@@ -37,11 +39,15 @@ def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays():
     order = torch.argsort(degrees, descending=True, stable=True)
     assert torch.equal(raw["means"], means[order])
     for name, value in raw.items():
-        assert len(value) == (int((degrees >= int(name[2])).sum()) if name in ("sh1", "sh2", "sh3") else len(order))
+        assert len(value) == (
+            int((degrees >= int(name[2])).sum()) if name in ("sh1", "sh2", "sh3") else len(order)
+        )
         state = made.optimizer.state[value]
         for key in ("exp_avg", "exp_avg_sq"):
             assert torch.equal(state[key], moments[name][key][order[: len(value)]])
-    assert "sh_logits" not in raw and "sh_logits" not in {g["name"] for g in made.optimizer.param_groups}
+    assert "sh_logits" not in raw and "sh_logits" not in {
+        g["name"] for g in made.optimizer.param_groups
+    }
     assert 0 < len(raw["sh3"]) < len(raw["sh2"]) < len(raw["sh1"]) < len(order)
     for _ in steps:  # trains on
         pass
@@ -53,7 +59,9 @@ def test_closed_bands_leave_parameters_and_moments_and_the_picture_stays():
 
 @pytest.mark.parametrize("steps", [1, 6])
 def test_a_training_of_few_steps_does_not_grow_after_the_freeze(steps):
-    made = tiny_trainer(steps=steps, n_densify=12, max_gaussians=3000, lr_sh_masks=0.0, densify="classic")
+    made = tiny_trainer(
+        steps=steps, n_densify=12, max_gaussians=3000, lr_sh_masks=0.0, densify="classic"
+    )
     with torch.no_grad():
         made.model.raw["sh_logits"][::2] = -8.0
     for _ in made.steps():
@@ -64,9 +72,13 @@ def test_a_training_of_few_steps_does_not_grow_after_the_freeze(steps):
 def test_a_band_that_nobody_keeps_is_gone():
     made = tiny_trainer(densify="off")
     with torch.no_grad():
-        made.model.raw["sh_logits"].copy_(torch.tensor([8.0, -8.0, 8.0]).expand_as(made.model.raw["sh_logits"]))
+        made.model.raw["sh_logits"].copy_(
+            torch.tensor([8.0, -8.0, 8.0]).expand_as(made.model.raw["sh_logits"])
+        )
     made.population.freeze_bands(made.optimizer)
-    assert {"sh2", "sh3"}.isdisjoint(made.model.raw) and len(made.model.raw["sh1"]) == len(made.model)
+    assert {"sh2", "sh3"}.isdisjoint(made.model.raw) and len(made.model.raw["sh1"]) == len(
+        made.model
+    )
     assert {"sh2", "sh3"}.isdisjoint(group["name"] for group in made.optimizer.param_groups)
 
 
@@ -89,7 +101,9 @@ def test_gaussians_removed_after_the_freeze_take_their_bands_along():
 
 
 def test_opacities_fall_as_often_as_asked_while_gaussians_grow_and_rise_between():
-    made = tiny_trainer(steps=80, densify="off", prune=False, opacity_resets=3, densify_from=0.2, densify_until=0.6)
+    made = tiny_trainer(
+        steps=80, densify="off", prune=False, opacity_resets=3, densify_from=0.2, densify_until=0.6
+    )
     fallen, highest = [], 0.0
     for _ in made.steps():
         opacities = made.model.raw["logit_opacities"]
@@ -133,7 +147,8 @@ def bits(made):
 
 @pytest.mark.parametrize(
     "chosen",
-    [{"densify": name} for name in ("mixed", "region", "classic")] + [{"densify": "classic", "opacity_resets": 3}],
+    [{"densify": name} for name in ("mixed", "region", "classic")]
+    + [{"densify": "classic", "opacity_resets": 3}],
     ids=lambda chosen: "-".join(map(str, chosen.values())),
 )
 def test_a_resumed_training_takes_the_same_steps_to_the_bit(tmp_path, chosen):
@@ -153,7 +168,9 @@ def test_a_resumed_training_takes_the_same_steps_to_the_bit(tmp_path, chosen):
             pass
         found = bits(resumed)
         assert found.keys() == wanted.keys()
-        assert not [name for name, value in wanted.items() if not torch.equal(found[name], value)], step
+        assert not [
+            name for name, value in wanted.items() if not torch.equal(found[name], value)
+        ], step
         for name, value in resumed.finish().items():
             assert np.array_equal(value, parameters[name]), name
 
@@ -177,7 +194,8 @@ def test_a_picture_without_features_has_the_colours_of_one_with_them():
 def test_growth_without_semantic_guidance_takes_the_same_steps_and_other_places():
     """The loss is split into two backward passes; their sum moves parameters as one does."""
     guided, alone = (
-        tiny_trainer(steps=20, densify_from=0.8, densify_until=0.8, densify_semantic=k) for k in (True, False)
+        tiny_trainer(steps=20, densify_from=0.8, densify_until=0.8, densify_semantic=k)
+        for k in (True, False)
     )
     for made in (guided, alone):
         with torch.no_grad():  # features of zero would not move geometry
@@ -202,7 +220,8 @@ def test_gaussians_that_break_are_removed_and_counted():
     steps = made.steps()
     next(steps)
     with torch.no_grad():
-        made.model.raw["sh0"][7] = torch.nan  # the rasterizer leaves it out, so the loss stays finite
+        # the rasterizer leaves it out, so the loss stays finite
+        made.model.raw["sh0"][7] = torch.nan
     for _ in steps:
         pass
     assert made.population.n_broken == 1
@@ -212,7 +231,11 @@ def test_gaussians_that_break_are_removed_and_counted():
 def test_a_view_that_makes_the_loss_non_finite_is_named():
     made = tiny_trainer()
     made.views.features = lambda index: torch.full((10, 12, 8), torch.nan)
-    with pytest.raises(DataFailure, match=r"step 1, view view\d: loss features is not finite; .* look at the view"):
+    with pytest.raises(
+        DataFailure,
+        match=r"step 1, view view\d: loss features is not finite; .* "
+        r"look at the view",
+    ):
         next(made.steps())
 
 
@@ -268,13 +291,16 @@ print(hashlib.sha256(b"".join(value.tobytes() for value in made.finish().values(
 def test_kernels_just_compiled_and_kernels_from_the_cache_give_the_same_bits(tmp_path):
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", PRINT_BITS]
-    first, second = (subprocess.run(command, env=environment, capture_output=True, text=True) for _ in range(2))
+    first, second = (
+        subprocess.run(command, env=environment, capture_output=True, text=True) for _ in range(2)
+    )
     assert first.returncode == 0, first.stderr
     assert first.stdout == second.stdout
 
 
 @pytest.mark.parametrize(
-    ("settings", "rate"), [({"steps": 1000}, 1e-2), ({"steps": 50}, 5e-2), ({"steps": 1000, "lr_features": 3e-3}, 3e-3)]
+    ("settings", "rate"),
+    [({"steps": 1000}, 1e-2), ({"steps": 50}, 5e-2), ({"steps": 1000, "lr_features": 3e-3}, 3e-3)],
 )
 def test_the_features_rate_fits_the_number_of_steps(settings, rate):
     made = tiny_trainer(lr_sh=0.0, **settings)
@@ -320,7 +346,13 @@ def test_rates_follow_the_number_of_steps_unless_they_are_given():
     assert published["means"] == 1.6e-4 and published["sh0"] == 2.5e-3
     assert rates(decided(steps=100_000))["means"] == published["means"]
     short, default = rates(decided(steps=1000)), rates(decided(steps=3000))
-    for name, factor in (("means", 8), ("log_scales", 5.86), ("quats", 5.86), ("sh0", 4), ("sh3", 4)):
+    for name, factor in (
+        ("means", 8),
+        ("log_scales", 5.86),
+        ("quats", 5.86),
+        ("sh0", 4),
+        ("sh3", 4),
+    ):
         assert short[name] / published[name] == pytest.approx(factor, rel=0.02)
         assert published[name] < default[name] < short[name]
     assert rates(decided(steps=60))["means"] == short["means"]
@@ -336,7 +368,9 @@ def test_pruning_masks_go_no_farther_in_long_trainings_and_nothing_else_slows():
     assert travel("prune_logits", 9000) == pytest.approx(travel("prune_logits", 3000), rel=1e-2)
     assert travel("sh_logits", 9000) == pytest.approx(3 * travel("sh_logits", 3000), rel=1e-2)
     timed = Schedule(decided(seconds=120.0))  # as many steps as the pace tells
-    assert timed.rate("prune_logits", 0.5, timed.last_step(4000, 60.0)) == pytest.approx(3 / 8 * 0.1**0.5)
+    assert timed.rate("prune_logits", 0.5, timed.last_step(4000, 60.0)) == pytest.approx(
+        3 / 8 * 0.1**0.5
+    )
 
 
 def test_photos_larger_than_a_step_takes_are_seen_reduced_then_in_windows(monkeypatch):

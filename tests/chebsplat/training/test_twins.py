@@ -9,7 +9,8 @@ from chebsplat.stages.runtime import config as configs
 from chebsplat.training.losses import feature_distance
 
 STEPS = 200
-LIMIT = 2 / 255  # what a pair at the limit of 1/255 may change, where rounding decides whether it is drawn
+# what a pair at the limit of 1/255 may change, where rounding decides whether it is drawn
+LIMIT = 2 / 255
 
 
 @pytest.fixture
@@ -17,7 +18,9 @@ def trainer_of(up_to_teacher):
     """Makes a trainer of the toy scene before its first step, by backend and settings."""
 
     def make(backend, **train):
-        return trainer_from(up_to_teacher, configs.build({"train": {"steps": STEPS} | train}, "toy"), backend)
+        return trainer_from(
+            up_to_teacher, configs.build({"train": {"steps": STEPS} | train}, "toy"), backend
+        )
 
     return make
 
@@ -52,7 +55,8 @@ def gradients(trainer):
 
 @pytest.mark.slow
 def test_two_hundred_steps_in_plain_torch_reach_the_same_psnr(trainer_of, no_kernels):
-    # Without growth: which Gaussians grow is decided by comparisons, and what rounding decides there is worth 0.1 dB.
+    # Without growth: which Gaussians grow is decided by comparisons, and what rounding decides
+    # there is worth 0.1 dB.
     settings = {"densify": "off"}
     compiled, plain = trainer_of("auto", **settings), trainer_of("reference", **settings)
     for _ in compiled.steps():
@@ -69,12 +73,15 @@ def test_two_hundred_steps_in_plain_torch_reach_the_same_psnr(trainer_of, no_ker
 @pytest.mark.parametrize("after", [1, 26], ids=["at the start", "with masks and bands"])
 def test_gradients_of_a_step_in_plain_torch_are_those_of_the_kernels(after, trainer_of):
     settings = {"densify": "off", "prune_from": 0.1, "feature_every": 1}
-    compiled, plain = (trainer_of(backend, steps=40, **settings) for backend in ("auto", "reference"))
+    compiled, plain = (
+        trainer_of(backend, steps=40, **settings) for backend in ("auto", "reference")
+    )
     steps = compiled.steps()
     for _ in range(after):
         next(steps)
     farthest = []
-    for _ in range(3):  # one step in ten has a pair whose drawing rounding decides, which those behind it feel
+    # one step in ten has a pair whose drawing rounding decides, which those behind it feel
+    for _ in range(3):
         plain.load_state_dict(torch.load(_saved(compiled), weights_only=True))
         figures = next(steps), next(plain.steps())
         assert figures[0].keys() == figures[1].keys()
@@ -83,7 +90,12 @@ def test_gradients_of_a_step_in_plain_torch_are_those_of_the_kernels(after, trai
         found, wanted = gradients(plain), gradients(compiled)
         assert found.keys() == wanted.keys()
         if after > 1:
-            assert {"sh1", "sh_logits", "prune_logits", "semantic_gate.linear.weight"} <= wanted.keys()
+            assert {
+                "sh1",
+                "sh_logits",
+                "prune_logits",
+                "semantic_gate.linear.weight",
+            } <= wanted.keys()
             assert wanted["sh1"].any() and wanted["sh_logits"].any()
         off = {}
         for name, expected in wanted.items():
@@ -110,7 +122,10 @@ def test_cells_that_do_not_count_may_be_anything_in_plain_torch_too(kind):
     render = torch.rand(8, 8, 3, requires_grad=True)
     target, counted = torch.rand(4, 4, 3), torch.ones(4, 4, dtype=torch.bool)
     target[1, 2], counted[1, 2] = torch.nan, False
-    found = [feature_distance(render, target, None, kind, counted, backend) for backend in ("auto", "reference")]
+    found = [
+        feature_distance(render, target, None, kind, counted, backend)
+        for backend in ("auto", "reference")
+    ]
     assert found[0].item() == pytest.approx(found[1].item(), rel=1e-6)
     (gradient,) = torch.autograd.grad(found[1], render)
     assert torch.isfinite(gradient).all() and (gradient[2:4, 4:6] == 0).all()

@@ -1,4 +1,6 @@
-"""Tables of a paper: planned and run on stand-ins of the paper's data, and what is not there is named."""
+"""Tables of a paper: planned and run on stand-ins of the paper's data, and what is not there is
+named.
+"""
 
 import csv
 import os
@@ -40,24 +42,41 @@ def with_classes(scene, names):
 
 @pytest.fixture
 def stand_ins(tmp_path, monkeypatch):
-    """A toy room as one scene of each data set, and a teacher that tells colours and has all words."""
+    """A toy room as one scene of each data set, and a teacher that tells colours and has all
+    words.
+    """
     scene = generated.capture("toy", 1, "toy")
     pixels = np.argwhere(np.ones(scene["depth"].shape[1:], bool))[::97]
     views = zip(scene["depth"], scene["Ks"], scene["cam_from_world"], strict=True)
-    scene["points"] = np.concatenate([unproject(*view, pixels) for view in views]).astype(np.float32)
-    scene["point_colors"] = np.concatenate([image[pixels[:, 0], pixels[:, 1]] for image in scene["images"]])
+    scene["points"] = np.concatenate([unproject(*view, pixels) for view in views]).astype(
+        np.float32
+    )
+    scene["point_colors"] = np.concatenate(
+        [image[pixels[:, 0], pixels[:, 1]] for image in scene["images"]]
+    )
     layouts.write_nice_slam(tmp_path / "replica/room_0", scene)
-    layouts.write_scannet_sg(tmp_path / "scannet/open/scene0050_02", with_classes(scene, scannet_open.CLASSES))
+    layouts.write_scannet_sg(
+        tmp_path / "scannet/open/scene0050_02", with_classes(scene, scannet_open.CLASSES)
+    )
     closed = with_classes(scene, scannet_closed.CLASSES)
-    closed |= {"pseudo_labels": closed["labels"], "confidence": np.full(closed["labels"].shape, 0.9)}
+    closed |= {
+        "pseudo_labels": closed["labels"],
+        "confidence": np.full(closed["labels"].shape, 0.9),
+    }
     layouts.write_scannet_pl(tmp_path / "scannet/closed/scene0144_01", closed)
     layouts.write_colmap(tmp_path / "blending/playroom", scene)
     (tmp_path / "teacher").mkdir()
     model = color_teacher(tmp_path / "teacher")
-    sets = [read_label_set(ROOT / f"teachers/labels/{name}.txt") for name in ("ade20k", "scannet20")]
+    sets = [
+        read_label_set(ROOT / f"teachers/labels/{name}.txt") for name in ("ade20k", "scannet20")
+    ]
     words = list(dict.fromkeys(word for names in sets for of in names.values() for word in of))
-    write_table(model.with_name("tiny.npz"), words, np.random.default_rng(0).normal(size=(len(words), 3)))
-    for name, value in zip(ROOTS, (*(tmp_path / of for of in ("replica", "scannet", "blending")), model), strict=True):
+    write_table(
+        model.with_name("tiny.npz"), words, np.random.default_rng(0).normal(size=(len(words), 3))
+    )
+    for name, value in zip(
+        ROOTS, (*(tmp_path / of for of in ("replica", "scannet", "blending")), model), strict=True
+    ):
         monkeypatch.setenv(name, str(value))
 
 
@@ -66,10 +85,19 @@ def test_without_any_data_the_tables_hold_the_papers_figures_and_name_what_is_la
     assert expand(asked) == []
     sections = published_sections(asked, [])
     assert [section.heading[:7] for section in sections] == [f"Table {k}" for k in range(1, 6)]
-    for section, root in zip(sections, (ROOTS[0], ROOTS[1], ROOTS[1], ROOTS[2], ROOTS[2]), strict=True):
-        assert {row[-1] for row in section.table[1:] if row[1] != "-"} == {f"all: {root} is not set"}
+    for section, root in zip(
+        sections, (ROOTS[0], ROOTS[1], ROOTS[1], ROOTS[2], ROOTS[2]), strict=True
+    ):
+        assert {row[-1] for row in section.table[1:] if row[1] != "-"} == {
+            f"all: {root} is not set"
+        }
     assert sections[0].table[4][:5] == ["Ours", "paper", "-", "81.1", "-"]
-    given = {key for table in asked.tables.values() for figures in table.published.values() for key in figures}
+    given = {
+        key
+        for table in asked.tables.values()
+        for figures in table.published.values()
+        for key in figures
+    }
     assert given <= {figure.key for figure in FIGURES}
     assert "1600 pixels at most" in sections[3].note and "592 pixels" in sections[2].note
     page = write(tmp_path, asked, [], [], "make study=paper-tables", sections)
@@ -85,7 +113,9 @@ def test_what_is_there_is_planned_each_table_by_its_own_protocol_and_without_a_t
     for run in expand(asked):
         sections = next(step.sections for step in run.plan.steps if step.stage == "ingest")
         ingest = sections["ingest"]
-        found.setdefault(run.condition[:7], set()).add((run.scene, ingest["protocol"], ingest["max_side"]))
+        found.setdefault(run.condition[:7], set()).add(
+            (run.scene, ingest["protocol"], ingest["max_side"])
+        )
     assert found == {
         "Table 1": {("room0", "replica-f3", 640)},
         "Table 2": {("scene0050_02", "scannet-open", 648)},
@@ -109,7 +139,10 @@ def test_what_is_there_is_planned_each_table_by_its_own_protocol_and_without_a_t
         ({"scenes": ["toy"]}, "either scenes or tables"),
         ({"conditions": {"other": {}}}, "either scenes or tables"),
         ({"variants": {"full": {}}}, "'paper' is none of the study's variants"),
-        ({"conditions": {"T": {}}, "tables": {"T": ROOM | {"variants": {"full": "Ours"}}}}, "'Ours' is no row"),
+        (
+            {"conditions": {"T": {}}, "tables": {"T": ROOM | {"variants": {"full": "Ours"}}}},
+            "'Ours' is no row",
+        ),
     ],
 )
 def test_tables_that_do_not_fit_their_study_are_refused(changes, message):
@@ -131,7 +164,13 @@ describe = { n_regions = 12 }
 train = { steps = 12, n_densify = 1, report_every = 6, max_gaussians = 400 }
 evaluate = { timing_repeats = 1 }
 """)
-    command = [sys.executable, "-m", "chebsplat.pipelines.cli", "study", str(tmp_path / "mine.toml")]
+    command = [
+        sys.executable,
+        "-m",
+        "chebsplat.pipelines.cli",
+        "study",
+        str(tmp_path / "mine.toml"),
+    ]
     command += ["--cores", "2", "--threads", "2", "--out", str(tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=os.environ)
     assert done.returncode == 0, done.stderr

@@ -53,7 +53,8 @@ def finished():
 def test_the_section_says_what_a_hand_works_out(finished):
     (section,) = sections(*finished)
     assert section.heading == "Seconds to what less ends with"
-    # full has office0's 0.5 (0.5 − 0.4) / 0.14 of the way from 30 to 40 s, and office1's 0.6 at once
+    # full has office0's 0.5 (0.5 − 0.4) / 0.14 of the way from 30 to 40 s, and office1's 0.6 at
+    # once
     assert [line[:5] for line in section.table[1:]] == [
         ["office0", "full", "50.0", "40", "37 (93 %)"],
         ["office1", "full", "60.0", "40", "≤30 (≤ 75 %)"],

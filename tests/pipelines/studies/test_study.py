@@ -24,7 +24,13 @@ from chebsplat.pipelines.studies import figures
 from chebsplat.pipelines.studies.page import write
 from chebsplat.pipelines.studies.pictures import gallery
 from chebsplat.pipelines.studies.results import compare, on_one_machine, row_of, traces
-from chebsplat.pipelines.studies.study import checked_study, execute, expand, outstanding, read_study
+from chebsplat.pipelines.studies.study import (
+    checked_study,
+    execute,
+    expand,
+    outstanding,
+    read_study,
+)
 from chebsplat.pipelines.studies.tables import Section, sections
 from chebsplat.pipelines.work.scenes import data_of, names
 from chebsplat.stages.registry import STAGES
@@ -53,8 +59,19 @@ def publish_stage(run, stage, fill, machine="A", **facts):
     if step.fresh:
         return
     code = {"commit": "c" * 40, "dirty": False}
-    manifest = Manifest(STAGES[stage].schema, step.key, stage, {}, step.sections, 0, facts, code=code)
-    manifest.processes = [{"processor": machine, "gpu": "", "cores": 4, "threads": 2, "load": [0.5, 1], "seconds": 9.0}]
+    manifest = Manifest(
+        STAGES[stage].schema, step.key, stage, {}, step.sections, 0, facts, code=code
+    )
+    manifest.processes = [
+        {
+            "processor": machine,
+            "gpu": "",
+            "cores": 4,
+            "threads": 2,
+            "load": [0.5, 1],
+            "seconds": 9.0,
+        }
+    ]
     step.path.parent.mkdir(parents=True, exist_ok=True)
     with publish(step.path, manifest) as tmp:
         fill(tmp)
@@ -63,16 +80,37 @@ def publish_stage(run, stage, fill, machine="A", **facts):
 ONE_LABEL = np.zeros((1, 4, 6), np.int16)
 
 
-def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation=None, labels=None, machine="A"):
-    """Pretend that a run was made and found these figures. labels: (class names, predicted i16 [1, 4, 6])."""
-    figures = {"image": {"psnr": psnr, "ssim": 0.9}, "n_gaussians": n, "bytes": {"ply": 10 * n, "ragged": 5 * n}}
-    figures |= {"frames_per_second": {"color": 50.0}, "protocol": {"resolution": "6x4", "split": "all"}}
+def finish(
+    run,
+    miou=0.5,
+    psnr=30.0,
+    n=100,
+    seconds=10.0,
+    steps=10,
+    segmentation=None,
+    labels=None,
+    machine="A",
+):
+    """Pretend that a run was made and found these figures. labels: (class names, predicted i16 [1,
+    4, 6]).
+    """
+    figures = {
+        "image": {"psnr": psnr, "ssim": 0.9},
+        "n_gaussians": n,
+        "bytes": {"ply": 10 * n, "ragged": 5 * n},
+    }
+    figures |= {
+        "frames_per_second": {"color": 50.0},
+        "protocol": {"resolution": "6x4", "split": "all"},
+    }
     whole = {"miou": miou, "macc": miou, "oa": miou, "boundary_miou": miou}
     figures["segmentation"] = segmentation or {"scene": whole, "teacher": whole | {"miou": 0.25}}
     if labels is not None:
         blank, K = np.zeros((1, 4, 6, 3), np.uint8), np.eye(3)[None]
         truth = np.zeros((1, 4, 6), np.int16)
-        capture = Capture(["a"], blank, K, np.eye(4)[None], np.array([True]), labels=truth, class_names=labels[0])
+        capture = Capture(
+            ["a"], blank, K, np.eye(4)[None], np.array([True]), labels=truth, class_names=labels[0]
+        )
         publish_stage(run, "ingest", capture.write)
     for step in run.steps:
         if step.stage not in ("train", "export", "evaluate"):
@@ -90,7 +128,9 @@ def finish(run, miou=0.5, psnr=30.0, n=100, seconds=10.0, steps=10, segmentation
 
 
 def finished(asked, **figures):
-    """Runs of a study as if they had been made and had found these figures, and a row of results of each."""
+    """Runs of a study as if they had been made and had found these figures, and a row of results of
+    each.
+    """
     runs = expand(asked)
     for run in runs:
         finish(run, **figures)
@@ -98,10 +138,15 @@ def finished(asked, **figures):
 
 
 def test_a_study_is_every_combination_and_each_step_once():
-    conditions = {"a": {"teacher": {"kind": "labels"}}, "b": {"teacher": {"kind": "labels", "confusion": 0.1}}}
+    conditions = {
+        "a": {"teacher": {"kind": "labels"}},
+        "b": {"teacher": {"kind": "labels", "confusion": 0.1}},
+    }
     runs = expand(study(conditions=conditions, budgets={"steps": [10, 20]}))
     assert len(runs) == 2 * 2 * 2 * 2
-    assert len({run.name for run in runs}) == len({run.plan.targets["evaluate"] for run in runs}) == 16
+    assert (
+        len({run.name for run in runs}) == len({run.plan.targets["evaluate"] for run in runs}) == 16
+    )
     counts = [step.stage for step in outstanding(runs)]
     assert {stage: counts.count(stage) for stage in counts} == {
         "ingest": 1, "sfm": 1, "teacher": 4, "agree": 4, "train": 16, "lift": 8,
@@ -141,9 +186,21 @@ def test_what_is_there_is_not_computed_again_and_is_kept(work):
 def test_figures_are_read_from_the_artifacts():
     asked = study(seeds=[3], variants={"less": {}})
     _, (row,) = finished(asked, miou=0.75, psnr=31.5, n=40, seconds=8.0)
-    expected = {"state": "done", "seed": 3, "miou": 0.75, "miou_gain": 0.5, "psnr": 31.5, "n_gaussians": 40}
+    expected = {
+        "state": "done",
+        "seed": 3,
+        "miou": 0.75,
+        "miou_gain": 0.5,
+        "psnr": 31.5,
+        "n_gaussians": 40,
+    }
     expected |= {"miou_teacher": 0.25, "boundary_miou_teacher": 0.75, "point_miou_teacher": None}
-    expected |= {"sh_kept": 190 / 640, "bytes_ply": 400, "bytes_ragged": 200, "frames_per_second": 50.0}
+    expected |= {
+        "sh_kept": 190 / 640,
+        "bytes_ply": 400,
+        "bytes_ragged": 200,
+        "frames_per_second": 50.0,
+    }
     expected |= {"lpips": None, "resolution": "6x4", "split": "all"}
     expected |= {"train_seconds": 8.0, "held_in_psnr": 25.0, "steps": 10, "clock": None}
     expected |= {"trained_on": "A, 2 threads", "rendered_on": "A, 2 threads"}
@@ -162,7 +219,8 @@ def test_the_table_says_what_a_hand_works_out():
         finish(run, miou[run.scene, run.seed] + (0.02 if full else 0), n=50 if full else 100)
     lines = compared(runs, [row_of(run, {}) for run in runs])
     assert lines["less"].summaries["miou"].mean == pytest.approx(0.56)
-    assert lines["less"].summaries["miou"].spread == pytest.approx((0.0072 / 3) ** 0.5)  # .06² + .02² + 2 × .04²
+    # .06² + .02² + 2 × .04²
+    assert lines["less"].summaries["miou"].spread == pytest.approx((0.0072 / 3) ** 0.5)
     assert lines["less"].differences == {}
     gain = lines["full"].differences["miou"]
     assert (gain.mean, gain.n_pairs, gain.n_units) == (pytest.approx(0.02), 4, 2)
@@ -197,10 +255,16 @@ def test_seconds_of_two_machines_are_not_compared_and_the_page_says_whose_it_sho
     assert lines["20 steps", "less"].summaries["train_seconds"].mean == 10
     page = write(tmp_path, asked, runs, rows, "c", sections(asked, rows))
     for text in (page.read_text(), (tmp_path / "results.md").read_text().replace("\\", "")):
-        assert "training, s" in text and "is of the 18 runs on A, 2 threads alone; not compared: 6 on B" in text
+        assert (
+            "training, s" in text
+            and ("is of the 18 runs on A, 2 threads alone; not compared: 6 on B") in text
+        )
         assert "A, 2 threads; B, 2 threads" in text and "0.5 to 1" in text and by_clock in text
     with (tmp_path / "results.csv").open() as handle:
-        assert {row["trained_on"] for row in csv.DictReader(handle)} == {"A, 2 threads", "B, 2 threads"}
+        assert {row["trained_on"] for row in csv.DictReader(handle)} == {
+            "A, 2 threads",
+            "B, 2 threads",
+        }
 
 
 def test_a_study_of_one_machine_bewares_of_nothing(tmp_path):
@@ -209,10 +273,15 @@ def test_a_study_of_one_machine_bewares_of_nothing(tmp_path):
     assert "C, 2 threads" in page and "beware" not in page
 
 
-def test_scannet_opens_scenes_are_summed_and_those_of_scannet_closed_averaged_before_seeds_are_compared(tmp_path):
-    # truth and prediction of wall and floor, in pixels           alone            summed, as scannet-open has it
-    # toy      wall 9 right, 1 taken for floor; floor 1 right     (9/10 + 1/2)/2   wall 9/19, floor 1/11
-    # office0  floor 9, all taken for wall                        0                its mean: (9/19 + 1/11)/2
+def test_scannet_opens_scenes_are_summed_and_those_of_scannet_closed_averaged_before_seeds_are_compared(
+    tmp_path,
+):
+    # truth and prediction of wall and floor, in pixels           alone            summed, as
+    # scannet-open has it toy      wall 9 right, 1 taken for floor; floor 1 right     (9/10 + 1/2)/2
+    # wall 9/19, floor
+    # 1/11 office0  floor 9, all taken for wall                        0                its mean:
+    # (9/19 +
+    # 1/11)/2
     a, b = ([[0] * 20 for _ in range(20)] for _ in range(2))
     a[0][0], a[0][1], a[1][1], b[1][0] = 9, 1, 1, 9
     alone, summed = {"toy": (0.7, a), "office0": (0.0, b)}, (9 / 19 + 1 / 11) / 2
@@ -222,11 +291,20 @@ def test_scannet_opens_scenes_are_summed_and_those_of_scannet_closed_averaged_be
         for run in runs:
             miou, matrix = alone[run.scene]
             if (run.variant, run.seed) == ("full", 1):  # a seed in which every pixel is right
-                miou, matrix = 1.0, [[sum(row) if k == j else 0 for j in range(20)] for k, row in enumerate(matrix)]
+                miou, matrix = (
+                    1.0,
+                    [
+                        [sum(row) if k == j else 0 for j in range(20)]
+                        for k, row in enumerate(matrix)
+                    ],
+                )
             finish(run, segmentation={"scene": {"miou": miou, "confusion": matrix}})
         rows = [row_of(run, {}) for run in runs]
         lines = compared(runs, rows)
-        assert (lines["less"].summaries["miou"].mean, lines["less"].summaries["miou"].n) == (pytest.approx(expected), 2)
+        assert (lines["less"].summaries["miou"].mean, lines["less"].summaries["miou"].n) == (
+            pytest.approx(expected),
+            2,
+        )
         assert lines["full"].summaries["miou"].mean == pytest.approx((expected + 1) / 2)
         gain = lines["full"].differences["miou"]
         assert (gain.mean, gain.n_pairs) == (pytest.approx((1 - expected) / 2), 2)
@@ -265,13 +343,22 @@ def test_the_page_shows_a_view_of_each_scene_in_one_set_of_colours(tmp_path):
     shown = gallery(asked, runs, rows)
     assert [row["name"] for row in shown["pictures"]] == ["toy", "office0"]
     toy, office = ({key: uri for key, uri, _ in row["images"]} for row in shown["pictures"])
-    assert toy["labels of less"] == toy["labels of full"] == office["labels of less"] != toy["labels"]
-    assert "render of full" not in office  # that run has failed; the slider says so by a button that is off
+    assert (
+        toy["labels of less"] == toy["labels of full"] == office["labels of less"] != toy["labels"]
+    )
+    # that run has failed; the slider says so by a button that is off
+    assert "render of full" not in office
     assert [name for name, _ in shown["legend"]] == ["wall", "sofa"]
     classes = [(name, mean, other) for name, _, mean, other in shown["classes"]]
     assert classes == [("sofa", 0.75, 0.5), ("wall", 0.25, None)]
     assert shown["shown"] == "20 steps, seed 0"
-    names = ["photo | full", "true labels | full", "photo | less", "less | full", "less | full, labels"]
+    names = [
+        "photo | full",
+        "true labels | full",
+        "photo | less",
+        "less | full",
+        "less | full, labels",
+    ]
     assert [mode[0] for mode in shown["modes"]] == names
     page = write(tmp_path, asked, runs, rows, "c").read_text()
     assert page.count("data-of=") == 6 + 4
@@ -279,21 +366,42 @@ def test_the_page_shows_a_view_of_each_scene_in_one_set_of_colours(tmp_path):
         seen, console, _ = browsed(tmp_path, page, 1440)
         assert seen["problems"] == console == []
         assert len(seen["shown"]) == 2 and all(seen["shown"])
-    assert '<td class="w">LPIPS</td><td class="w">not measured</td><td class="w" data-label="by">all</td>' in page
+    assert (
+        '<td class="w">LPIPS</td><td class="w">not measured</td><td class="w" '
+        'data-label="by">all</td>'
+    ) in page
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="neither chromium nor google-chrome is installed")
 @pytest.mark.parametrize("wide", [1440, 390])
 def test_in_a_browser_nothing_of_a_crowded_study_is_cut_off(tmp_path, wide):
-    values = {"conditions": {f"noise {p}": {"teacher": {"confusion": p}} for p in (0.1, 0.3)}, "baseline": "plain-3dgs"}
-    values |= {"variants": {"plain-3dgs": {}, "feature-3dgs equivalent": {"train": {"sh_prune": False}}, "less": {}}}
+    values = {
+        "conditions": {f"noise {p}": {"teacher": {"confusion": p}} for p in (0.1, 0.3)},
+        "baseline": "plain-3dgs",
+    }
+    values |= {
+        "variants": {
+            "plain-3dgs": {},
+            "feature-3dgs equivalent": {"train": {"sh_prune": False}},
+            "less": {},
+        }
+    }
     asked = study(**values, scenes=["toy", "office0"], budgets={"steps": [1000, 3000]})
     runs = expand(asked)
     for k, run in enumerate(runs):
-        finish(run, 0.71 + 0.004 * k, 31.2 + 0.1 * k, 25_000 + 791 * k, 300 + k, labels=(["wall", "sofa"], ONE_LABEL))
+        finish(
+            run,
+            0.71 + 0.004 * k,
+            31.2 + 0.1 * k,
+            25_000 + 791 * k,
+            300 + k,
+            labels=(["wall", "sofa"], ONE_LABEL),
+        )
     rows = [row_of(run, {}) | {"point_miou": 0.5 + 0.01 * k} for k, run in enumerate(runs)]
-    section = Section("More", "By place.", [["a", "b", *["mIoU − its 2D teacher's, points"] * 6], ["x"] * 8])
+    section = Section(
+        "More", "By place.", [["a", "b", *["mIoU − its 2D teacher's, points"] * 6], ["x"] * 8]
+    )
     page = write(tmp_path, asked, runs, rows, "make study=crowded", [section]).read_text()
     seen, console, requests = browsed(tmp_path, page, wide)
     assert seen["problems"] == console == requests == seen["cut"] == []
@@ -301,13 +409,19 @@ def test_in_a_browser_nothing_of_a_crowded_study_is_cut_off(tmp_path, wide):
 
 
 def named_study(folder, names):
-    """A study whose title, conditions, variants and labels have these names: its page and its Markdown."""
+    """A study whose title, conditions, variants and labels have these names: its page and its
+    Markdown.
+    """
     variants = {name: {"train": {"seed": k}} for k, name in enumerate(names[::4])}
     asked = study(title=names[0], about=names[1], seeds=[0], baseline=names[0], variants=variants,
                   conditions={names[2]: {"teacher": {"kind": "labels"}}})  # fmt: skip
     runs = expand(asked)
     for run in runs[:-1]:
-        finish(run, segmentation={"scene": {"iou": dict.fromkeys(names, 0.5)}}, labels=(names, ONE_LABEL))
+        finish(
+            run,
+            segmentation={"scene": {"iou": dict.fromkeys(names, 0.5)}},
+            labels=(names, ONE_LABEL),
+        )
     rows = [row_of(run, {}) | {"miou": 0.5} for run in runs[:-1]] + [row_of(runs[-1], {})]
     section = Section(names[3], names[4], [["what", "figure"], *([name, "1"] for name in names)])
     page = write(folder, asked, runs, rows, f"make study={names[5]}", [section]).read_text()
@@ -372,9 +486,16 @@ def test_a_figure_of_colour_alone_has_a_panel_for_each_scene(tmp_path, monkeypat
     figures.draw(tmp_path / "figure.png", rows, traces(runs, rows), None, "")
     assert [panel.get_title()[:9] for panel in panels] == ["test PSNR", "test mIoU", "PSNR on w"]
     panels.clear()
-    figures.draw(tmp_path / "figure.png", [row | {"miou": None} for row in rows], traces(runs, rows), None, "")
+    figures.draw(
+        tmp_path / "figure.png",
+        [row | {"miou": None} for row in rows],
+        traces(runs, rows),
+        None,
+        "",
+    )
     assert [panel.get_title() for panel in panels] == ["toy", "office0"]
-    assert all(len(panel.lines) >= 2 for panel in panels)  # test views, and the trace of views trained on
+    # test views, and the trace of views trained on
+    assert all(len(panel.lines) >= 2 for panel in panels)
 
 
 @pytest.mark.parametrize("name", names("studies"))
@@ -382,7 +503,9 @@ def test_every_study_of_ours_can_be_planned(name):
     found = read_study(name)
     if found.tables:
         pytest.skip("tables of a paper: tests/pipelines/studies/test_published.py")
-    there = [scene for scene in found.scenes if (needed := data_of(scene)) is None or needed[1].is_dir()]
+    there = [
+        scene for scene in found.scenes if (needed := data_of(scene)) is None or needed[1].is_dir()
+    ]
     if not there:
         pytest.skip(f"{', '.join(found.scenes)}: no data (CHEBSPLAT_TEST_DATA)")
     runs = expand(found.model_copy(update={"scenes": there[:1], "seeds": found.seeds[:1]}))
@@ -415,7 +538,9 @@ def test_an_extension_of_what_is_not_there_is_an_error_that_names_it(changes, me
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("cli")
-def test_a_study_goes_on_after_a_failure_and_a_second_call_computes_only_what_failed(tmp_path, work):
+def test_a_study_goes_on_after_a_failure_and_a_second_call_computes_only_what_failed(
+    tmp_path, work
+):
     (tmp_path / "vgg.safetensors").write_text("no weights")
     (tmp_path / "mine.toml").write_text(f"""
 title = "Mine"
@@ -432,7 +557,13 @@ train = {{ steps = 12, n_densify = 1, report_every = 6 }}
 evaluate = {{ lpips_weights = "{tmp_path}/vgg.safetensors" }}
 train = {{ sh_degree = 2 }}
 """)
-    command = [sys.executable, "-m", "chebsplat.pipelines.cli", "study", str(tmp_path / "mine.toml")]
+    command = [
+        sys.executable,
+        "-m",
+        "chebsplat.pipelines.cli",
+        "study",
+        str(tmp_path / "mine.toml"),
+    ]
     command += ["--cores", "1", "--threads", "2", "--out", str(tmp_path / "out")]
     for to_run in (
         "1 ingest, 1 sfm, 1 teacher, 1 agree, 2 train, 2 lift, 2 refine, 2 export, 2 evaluate",

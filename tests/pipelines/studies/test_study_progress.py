@@ -12,7 +12,9 @@ from chebsplat.pipelines.studies.study import reported
 
 @pytest.fixture
 def runs():
-    return [SimpleNamespace(name=f"run-{k}", steps=[SimpleNamespace(fresh=False)]) for k in range(3)]
+    return [
+        SimpleNamespace(name=f"run-{k}", steps=[SimpleNamespace(fresh=False)]) for k in range(3)
+    ]
 
 
 def finish(run):
@@ -29,7 +31,9 @@ def test_every_run_is_told_once_when_it_is_done(runs):
     assert told == ["  2 of 3 done: run-1", "  3 of 3 done: run-2"]
 
 
-def test_what_shows_the_runs_is_written_while_they_go_on_and_a_failure_of_that_is_told(runs, monkeypatch):
+def test_what_shows_the_runs_is_written_while_they_go_on_and_a_failure_of_that_is_told(
+    runs, monkeypatch
+):
     monkeypatch.setattr(study, "EVERY", 0.01)
     monkeypatch.setattr(study, "REFRESH", 0.02)
     told, written = [], threading.Event()

@@ -1,4 +1,6 @@
-"""Poses that a sensor gave are adjusted to the photos, in the frame and units that they were given in."""
+"""Poses that a sensor gave are adjusted to the photos, in the frame and units that they were given
+in.
+"""
 
 import numpy as np
 import pycolmap
@@ -6,7 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from chebsplat.cameras import centers
-from chebsplat.stages.reconstruction.adjustment import adjust, alignment, differences, frame, localized
+from chebsplat.stages.reconstruction.adjustment import (
+    adjust,
+    alignment,
+    differences,
+    frame,
+    localized,
+)
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.sfm import filled
@@ -25,7 +33,8 @@ def test_alignment_finds_the_similarity_between_two_worlds(on_a_line):
     places = np.outer(np.arange(8.0), [1, 2, 3]) if on_a_line else rng.normal(size=(8, 3))
     rotations, turn = Rotation.random(8, rng=rng).as_matrix(), Rotation.random(rng=rng).as_matrix()
     given = poses_of(rotations, places)
-    found = poses_of(rotations @ turn, (places - [4, 5, 6]) @ turn / 0.3)  # world = 0.3 turn x + (4, 5, 6)
+    # world = 0.3 turn x + (4, 5, 6)
+    found = poses_of(rotations @ turn, (places - [4, 5, 6]) @ turn / 0.3)
     scale, rotation, shift = alignment(found, given)
     assert scale == pytest.approx(0.3)
     np.testing.assert_allclose(rotation, turn, atol=1e-9)
@@ -45,7 +54,12 @@ def test_points_of_depth_fill_what_triangulation_leaves():
     rng = np.random.default_rng(2)
     own, more = rng.random((40, 3)), rng.random((400, 3))
     tracks = np.stack([np.repeat(np.arange(40), 2), np.tile([0, 1], 40)], 1)
-    cloud = {"means": own, "colors": np.zeros((40, 3), np.uint8), "seen_from": np.zeros(40, int), "tracks": tracks}
+    cloud = {
+        "means": own,
+        "colors": np.zeros((40, 3), np.uint8),
+        "seen_from": np.zeros(40, int),
+        "tracks": tracks,
+    }
     added = {"means": more, "colors": np.ones((400, 3), np.uint8), "seen_from": np.ones(400, int)}
     both = filled(cloud | {"notes": {}}, added, 200)
     first = both["notes"]["n_from_depth"]
@@ -54,7 +68,10 @@ def test_points_of_depth_fill_what_triangulation_leaves():
     assert triangulated.sum() == len(both["means"]) - first
     assert set(both["tracks"][:, 0]) == set(np.flatnonzero(triangulated))
     held = {tuple(point) for point in own}
-    assert all((tuple(point) in held) == mine for point, mine in zip(both["means"], triangulated, strict=True))
+    assert all(
+        (tuple(point) in held) == mine
+        for point, mine in zip(both["means"], triangulated, strict=True)
+    )
 
 
 @pytest.fixture
@@ -63,7 +80,10 @@ def synthetic(tmp_path):
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 16, 300
-    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.PINHOLE, [900, 900, 512, 384]
+    options.camera_model_id, options.camera_params = (
+        pycolmap.CameraModelId.PINHOLE,
+        [900, 900, 512, 384],
+    )
     noise = pycolmap.SyntheticNoiseOptions()
     noise.point2D_stddev = 0.5
     with pycolmap.Database.open(tmp_path / "database.db") as database:
@@ -87,7 +107,13 @@ def model_of(database, names, poses, focal):
         params = [focal, focal, 512, 384]
         if not model.exists_camera(image.camera_id):
             model.add_camera_with_trivial_rig(
-                pycolmap.Camera(model="PINHOLE", width=1024, height=768, params=params, camera_id=image.camera_id)
+                pycolmap.Camera(
+                    model="PINHOLE",
+                    width=1024,
+                    height=768,
+                    params=params,
+                    camera_id=image.camera_id,
+                )
             )
         fresh = pycolmap.Image(name=name, camera_id=image.camera_id, image_id=image.image_id)
         model.add_image_with_trivial_frame(fresh, pycolmap.Rigid3d(pose[:3]))
@@ -95,10 +121,14 @@ def model_of(database, names, poses, focal):
 
 
 def errors(poses, truth):
-    """Mean distance of centres, in the views' mean distance from their middle, and mean angle, degrees."""
+    """Mean distance of centres, in the views' mean distance from their middle, and mean angle,
+    degrees.
+    """
     scale, rotation, shift = alignment(poses, truth)
     size = np.linalg.norm(centers(truth) - centers(truth).mean(0), axis=1).mean()
-    apart = np.linalg.norm(scale * centers(poses) @ rotation.T + shift - centers(truth), axis=1).mean()
+    apart = np.linalg.norm(
+        scale * centers(poses) @ rotation.T + shift - centers(truth), axis=1
+    ).mean()
     turns = np.einsum("vij,kj,vlk->vil", poses[:, :3, :3], rotation, truth[:, :3, :3])
     return np.array([apart / size, np.degrees(Rotation.from_matrix(turns).magnitude().mean())])
 
@@ -129,7 +159,8 @@ def test_disturbed_poses_and_a_wrong_focal_length_are_found_again(synthetic):
     assert notes["focal_px"][1] == pytest.approx(900, rel=0.003)
     assert model.compute_mean_reprojection_error() < 1 < notes["reprojection_error_given_px"]
     assert notes["poses_kept"] == 0
-    assert np.linalg.norm(centers(found) - centers(given), axis=1).mean() < 0.03 * size  # in the frame that was given
+    # in the frame that was given
+    assert np.linalg.norm(centers(found) - centers(given), axis=1).mean() < 0.03 * size
 
 
 def test_views_that_went_astray_do_not_turn_the_frame():
@@ -153,18 +184,29 @@ def test_a_view_is_found_among_the_points_of_others_or_stays_where_it_was_given(
     spread = np.radians(0.5), 0.02
     options = {"clear_points": True, "refine_intrinsics": False}
     model = model_of(database, names, truth, 900.0)
-    model = pycolmap.triangulate_points(model, database, job.scratch / "images", job.scratch, **options)
+    model = pycolmap.triangulate_points(
+        model, database, job.scratch / "images", job.scratch, **options
+    )
     turn = Rotation.from_rotvec([0.008, -0.006, 0.004]).as_matrix()
-    given = poses_of((turn @ truth[3, :3, :3])[None], centers(truth)[3:4] + np.array([0.02, -0.02, 0.01]))[0]
+    given = poses_of(
+        (turn @ truth[3, :3, :3])[None], centers(truth)[3:4] + np.array([0.02, -0.02, 0.01])
+    )[0]
     held = {image.name: image for image in model.images.values()}
     view, others = held[names[3]], [held[name] for name in names if name != names[3]]
     pose = np.eye(4)
     pose[:3] = localized(model, database, view, given, spread, others)
     before, after = (np.ravel(differences(p[None], truth[3:4])) for p in (given, pose))
     assert (after < before / 5).all()
-    np.testing.assert_allclose(localized(model, database, view, given, spread, []), given[:3], atol=1e-9)
-    far = poses_of((Rotation.from_rotvec([0.3, 0, 0]).as_matrix() @ truth[3, :3, :3])[None], centers(truth)[3:4])[0]
-    np.testing.assert_allclose(localized(model, database, view, far, spread, others), far[:3], atol=1e-9)
+    np.testing.assert_allclose(
+        localized(model, database, view, given, spread, []), given[:3], atol=1e-9
+    )
+    far = poses_of(
+        (Rotation.from_rotvec([0.3, 0, 0]).as_matrix() @ truth[3, :3, :3])[None],
+        centers(truth)[3:4],
+    )[0]
+    np.testing.assert_allclose(
+        localized(model, database, view, far, spread, others), far[:3], atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("weak", [1, 3])
@@ -191,7 +233,8 @@ def test_only_the_last_round_decides_whether_views_share_enough(synthetic, monke
     from chebsplat.stages.reconstruction import adjustment
 
     job, database, names, truth = synthetic
-    monkeypatch.setattr(adjustment, "ROUNDS", (0.01, 4.0, 2.0))  # at a hundredth of a pixel no point is left at first
+    # at a hundredth of a pixel no point is left at first
+    monkeypatch.setattr(adjustment, "ROUNDS", (0.01, 4.0, 2.0))
     model, notes = adjust(job, model_of(database, names, truth, 900.0), database, names, truth)
     assert notes["poses_kept"] == 0
     assert model.num_points3D() > 200

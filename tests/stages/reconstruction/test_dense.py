@@ -18,10 +18,14 @@ OTHERS = np.array([[k for k in range(5) if k != view] for view in range(5)])
 
 @pytest.fixture(scope="module")
 def wall():
-    """Five photos of a textured wall at z = 4 behind a nearer square at z = 2.5, from places along x; depth of each."""
+    """Five photos of a textured wall at z = 4 behind a nearer square at z = 2.5, from places along
+    x; depth of each.
+    """
     rng = np.random.default_rng(0)
     coarse = torch.from_numpy(rng.random((2, 1, 60, 80))).float()
-    textures = torch.nn.functional.interpolate(coarse, scale_factor=4, mode="bilinear").numpy()[:, 0]
+    textures = torch.nn.functional.interpolate(coarse, scale_factor=4, mode="bilinear").numpy()[
+        :, 0
+    ]
     K = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]])
     y, x = np.mgrid[: SIZE[1], : SIZE[0]] + 0.5
     rays = np.stack([(x - SIZE[0] / 2) / FOCAL, (y - SIZE[1] / 2) / FOCAL], -1)
@@ -30,7 +34,10 @@ def wall():
         near, far = (rays * z + [place, 0] for z in (2.5, 4.0))
         front = (np.abs(near) < 0.35).all(-1)
         at = np.where(front[..., None], near, far)
-        pick = [((at[..., side] + 2) * 40).clip(0, limit - 1).astype(int) for side, limit in ((1, 240), (0, 320))]
+        pick = [
+            ((at[..., side] + 2) * 40).clip(0, limit - 1).astype(int)
+            for side, limit in ((1, 240), (0, 320))
+        ]
         images.append(np.where(front, textures[0][tuple(pick)], textures[1][tuple(pick)]))
         depths.append(np.where(front, 2.5, 4.0))
         pose = np.eye(4)
@@ -56,8 +63,16 @@ def cloud_of(wall):
 
 
 def capture_of(wall, **more):
-    fields = {"names": [str(k) for k in range(5)], "images": wall[0], "size": SIZE, "loss_mask": None, "depth": None}
-    return SimpleNamespace(**(fields | {"is_test": np.array([False, False, True, False, False])} | more))
+    fields = {
+        "names": [str(k) for k in range(5)],
+        "images": wall[0],
+        "size": SIZE,
+        "loss_mask": None,
+        "depth": None,
+    }
+    return SimpleNamespace(
+        **(fields | {"is_test": np.array([False, False, True, False, False])} | more)
+    )
 
 
 def test_a_sweep_finds_depth_between_its_steps(wall):
@@ -98,7 +113,8 @@ def test_what_other_views_see_through_goes_however_many_share_it(wall):
     _, Ks, poses, depths = wall
     floating = depths.astype(np.float32)
     corner = np.s_[5:20, 60:90]  # of the wall
-    floating[:2][:, *corner] = 1.6  # two views share a thing in the air; three see the wall behind it
+    # two views share a thing in the air; three see the wall behind it
+    floating[:2][:, *corner] = 1.6
     kept = plane_sweep.agreed(floating, Ks, poses, OTHERS, 1)
     assert (kept[0][corner] > 0).mean() < 0.3
     assert (kept[4][corner] > 0).mean() > 0.9  # which hides nothing from these, and denies nothing
@@ -114,7 +130,9 @@ def test_unknown_depth_and_views_that_compare_with_none_stay_unknown(wall):
 
 
 def test_points_beside_the_cameras_leave_a_sweep_where_it_looks(wall, job):
-    """Views from within a room have points behind the edges of every photo, nearer than anything in it."""
+    """Views from within a room have points behind the edges of every photo, nearer than anything in
+    it.
+    """
     cloud = cloud_of(wall)
     beside = np.random.default_rng(2).uniform([1, -1, 0.01], [3, 1, 0.1], (20, 3))
     both = cloud | {"means": np.concatenate([cloud["means"], beside])}
@@ -162,9 +180,14 @@ def test_points_are_added_where_most_cells_are_empty_and_never_beside_depth(wall
     assert dense.wants_more(job, capture_of(wall), full, SfmSection(dense="on"))
 
 
-def test_where_no_point_is_known_points_of_the_photos_colours_lie_far_behind_all_others(wall, monkeypatch):
-    """All points but the last are in the middle; the last, five deep, is the farthest 99 of 100 times."""
-    assert len(dense.backdrop(capture_of(wall), cloud_of(wall))["means"]) == 0  # these cameras look one way
+def test_where_no_point_is_known_points_of_the_photos_colours_lie_far_behind_all_others(
+    wall, monkeypatch
+):
+    """All points but the last are in the middle; the last, five deep, is the farthest 99 of 100
+    times.
+    """
+    # these cameras look one way
+    assert len(dense.backdrop(capture_of(wall), cloud_of(wall))["means"]) == 0
     monkeypatch.setattr(dense, "FACING", -1.0)
     cloud, mask = cloud_of(wall), np.ones(wall[0].shape[:3], bool)
     cloud["means"] = np.concatenate([cloud["means"], np.tile([[0.0, 0.0, 5.0]], (20, 1))])
@@ -174,11 +197,14 @@ def test_where_no_point_is_known_points_of_the_photos_colours_lie_far_behind_all
     np.testing.assert_allclose(found["means"][:, 2], 7.5)
     first = found["seen_from"] == 0
     x, y = ((found["means"][first, :2] + [0.4, 0]) / 7.5 * FOCAL + [80, 60]).T
-    assert x.min() == pytest.approx(28) and x.max() == pytest.approx(156)  # middles of cells of 8 pixels
+    # middles of cells of 8 pixels
+    assert x.min() == pytest.approx(28) and x.max() == pytest.approx(156)
     held = dense.cells_with(wall[1][0], wall[2][0], cloud["means"], SIZE)
     assert len(x) == (~held)[:, 3:].sum() and held.any()
     cells = wall[0][0].reshape(15, 8, 20, 8, 3).mean((1, 3))
-    np.testing.assert_allclose(found["colors"][first], cells[(y / 8).astype(int), (x / 8).astype(int)], atol=1)
+    np.testing.assert_allclose(
+        found["colors"][first], cells[(y / 8).astype(int), (x / 8).astype(int)], atol=1
+    )
 
 
 def test_cameras_all_around_something_face_one_another_and_those_in_a_row_or_back_to_back_do_not():

@@ -1,4 +1,6 @@
-"""Photos that come alone: cameras, lenses and poses are found, and models that are not to be believed are refused."""
+"""Photos that come alone: cameras, lenses and poses are found, and models that are not to be
+believed are refused.
+"""
 
 import json
 import shutil
@@ -30,7 +32,9 @@ GOOD = {
 
 def pairs_of(n, agree, deny=()):
     rows = [*agree, *deny]
-    return judge.Pairs(list(range(100, 100 + n)), np.array(rows), np.repeat([0.7, 0.0], [len(agree), len(deny)]))
+    return judge.Pairs(
+        list(range(100, 100 + n)), np.array(rows), np.repeat([0.7, 0.0], [len(agree), len(deny)])
+    )
 
 
 def ring(first, n):
@@ -43,11 +47,16 @@ def ring(first, n):
         (pairs_of(8, ring(0, 8)), []),
         (pairs_of(8, ring(0, 7), [(7, 2), (7, 3)]), [7]),  # what has no pair that agrees
         (pairs_of(9, [*ring(0, 8), (8, 0)], [(8, 3), (8, 4)]), [8]),
-        (pairs_of(12, ring(0, 7) + ring(7, 4) + [(11, 0), (11, 7)], [(11, 3), (11, 4), (11, 8)]), [7, 8, 9, 10, 11]),
+        (
+            pairs_of(12, ring(0, 7) + ring(7, 4) + [(11, 0), (11, 7)], [(11, 3), (11, 4), (11, 8)]),
+            [7, 8, 9, 10, 11],
+        ),
         (pairs_of(8, ring(0, 8), [(0, 4)]), []),  # one in three tells nothing
     ],
 )
-def test_photos_that_their_pairs_contradict_are_left_out_and_groups_that_hang_on_them(found, absent):
+def test_photos_that_their_pairs_contradict_are_left_out_and_groups_that_hang_on_them(
+    found, absent
+):
     assert judge.misplaced(found) == [100 + k for k in absent]
 
 
@@ -56,7 +65,10 @@ def test_photos_that_their_pairs_contradict_are_left_out_and_groups_that_hang_on
     [
         ({"n_in_others": [8], "n_registered": 12}, "2 groups that hardly meet"),
         ({"n_registered": 15}, "5 of 20 photos could not be placed"),
-        ({"n_misplaced": 3, "n_registered": 17}, "3 photos are left out that most of their matches contradict"),
+        (
+            {"n_misplaced": 3, "n_registered": 17},
+            "3 photos are left out that most of their matches contradict",
+        ),
         ({"pairs_agree": 0.5}, "Only 50% of the pairs"),
         ({"mapped_error": 3e-3}, "lock focus and zoom"),
         ({"points_a_view": 30.0}, "only 30 points"),
@@ -94,7 +106,9 @@ def test_a_model_that_is_not_to_be_believed_is_refused(n, changed, said):
         ({"peak_threshold": 0.001}, "SIMPLE_RADIAL", 0.2, ["OPENCV_FISHEYE"]),
     ],
 )
-def test_more_features_are_tried_and_a_fisheyes_lens_where_a_plain_one_is_none(settings, lens, registered, tried):
+def test_more_features_are_tried_and_a_fisheyes_lens_where_a_plain_one_is_none(
+    settings, lens, registered, tried
+):
     found = further(lens, PoseSection(**settings), registered)
     assert [name for name, _ in found] == tried
     assert all(peak <= PoseSection(**settings).peak_threshold for _, peak in found)
@@ -102,9 +116,15 @@ def test_more_features_are_tried_and_a_fisheyes_lens_where_a_plain_one_is_none(s
 
 def panorama(width):
     """All directions, each in its own colour, u8 [H, 2H, 3]."""
-    x, y = np.meshgrid((np.arange(width) + 0.5) / width * 2 - 1, (np.arange(width // 2) + 0.5) / width * 4 - 1)
+    x, y = np.meshgrid(
+        (np.arange(width) + 0.5) / width * 2 - 1, (np.arange(width // 2) + 0.5) / width * 4 - 1
+    )
     longitude, latitude = x * np.pi, y * np.pi / 2
-    rays = [np.sin(longitude) * np.cos(latitude), np.sin(latitude), np.cos(longitude) * np.cos(latitude)]
+    rays = [
+        np.sin(longitude) * np.cos(latitude),
+        np.sin(latitude),
+        np.cos(longitude) * np.cos(latitude),
+    ]
     return (127.5 + 127.5 * np.stack(rays, -1)).round().astype(np.uint8)
 
 
@@ -112,17 +132,26 @@ def test_faces_of_a_photo_of_all_directions_show_each_direction_where_their_pose
     file = tmp_path / "a.png"
     Image.fromarray(panorama(800)).save(file)
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0], [1, 2, 3]
+    pose[:3, :3], pose[:3, 3] = (
+        np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0],
+        [1, 2, 3],
+    )
     pose[:3, :3] *= np.linalg.det(pose[:3, :3])
     camera = Camera("EQUIRECTANGULAR", (800.0, 400.0), 800, 400)
     fields = assembly.assemble(
-        Listing("photos", [Frame("a", file, camera, pose)], upright=True), IngestSection(min_views=1)
+        Listing("photos", [Frame("a", file, camera, pose)], upright=True),
+        IngestSection(min_views=1),
     )
     assert fields["names"] == [f"a.{name}" for name in FACES]
     _, height, width, _ = fields["images"].shape
     assert height / width == pytest.approx(1.5, abs=0.01)
-    pixels = np.stack([*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), np.ones((height, width))], -1)
-    for image, K, found in zip(fields["images"], fields["Ks"], fields["cam_from_world"], strict=True):
+    pixels = np.stack(
+        [*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), np.ones((height, width))],
+        -1,
+    )
+    for image, K, found in zip(
+        fields["images"], fields["Ks"], fields["cam_from_world"], strict=True
+    ):
         rays = pixels @ np.linalg.inv(K).T @ found[:3, :3] @ pose[:3, :3].T  # in the photo's frame
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         inside = (slice(2, -2), slice(2, -2))
@@ -132,11 +161,20 @@ def test_faces_of_a_photo_of_all_directions_show_each_direction_where_their_pose
 
 def test_what_a_photo_of_all_directions_shows_is_seen_by_the_view_that_faces_it():
     rng, camera = np.random.default_rng(0), Camera("EQUIRECTANGULAR", (80.0, 40.0), 80, 40)
-    views = [view for name in "abc" for view in assembly.faces(Frame(name, None, camera, np.eye(4)))]
-    points, tracks = rng.normal(size=(150, 3)), np.stack([np.repeat(np.arange(150), 3), np.tile(np.arange(3), 150)], 1)
+    views = [
+        view for name in "abc" for view in assembly.faces(Frame(name, None, camera, np.eye(4)))
+    ]
+    points, tracks = (
+        rng.normal(size=(150, 3)),
+        np.stack([np.repeat(np.arange(150), 3), np.tile(np.arange(3), 150)], 1),
+    )
     cloud = colmap_model.Cloud(points, np.zeros((150, 3), np.uint8), np.ones(150), tracks)
     poses = np.stack([view.pose for view in views])
-    fields = {"names": [view.name for view in views], "cam_from_world": poses, "source": {"notes": []}}
+    fields = {
+        "names": [view.name for view in views],
+        "cam_from_world": poses,
+        "source": {"notes": []},
+    }
     point, view = colmap.points_of(cloud, list("abc"), fields)["tracks"].T
     assert len(point) == 450
     seen = np.einsum("tij,tj->ti", poses[view, :3, :3], points[point])
@@ -144,7 +182,10 @@ def test_what_a_photo_of_all_directions_shows_is_seen_by_the_view_that_faces_it(
 
 
 def test_a_photo_of_all_directions_closes_at_its_sides_and_a_wide_one_does_not(tmp_path):
-    for name, pixels in {"all": panorama(400), "wide": panorama(400)[:, 60:260].repeat(2, 1)}.items():
+    for name, pixels in {
+        "all": panorama(400),
+        "wide": panorama(400)[:, 60:260].repeat(2, 1),
+    }.items():
         Image.fromarray(pixels).save(tmp_path / f"{name}.png")
     (closed, wide), _ = photos._listed(tmp_path)
     assert closed.panorama and not wide.panorama
@@ -152,7 +193,11 @@ def test_a_photo_of_all_directions_closes_at_its_sides_and_a_wide_one_does_not(t
 
 def posed(folder, out, **settings):
     """The exit code of the stage `pose`, and its model."""
-    config = {"source": {"kind": "photos", "path": str(folder)}, "pose": settings, "ingest": {"max_side": 400}}
+    config = {
+        "source": {"kind": "photos", "path": str(folder)},
+        "pose": settings,
+        "ingest": {"max_side": 400},
+    }
     code = run_stage("pose", out, config=config)
     return code, PhotoModel.read(out) if code == 0 else None, config
 
@@ -166,7 +211,9 @@ def test_poses_and_the_lens_of_photos_are_found_and_what_it_bends_is_undone(tmp_
     files = sorted((data("fox") / "images").iterdir())[15:27]
     for file in files:
         small = Image.open(file).convert("RGB").resize((540, 960), Image.Resampling.BOX)
-        Image.fromarray(bent(np.asarray(small), focal, -0.15, cut)).save(folder / f"{file.stem}.png")
+        Image.fromarray(bent(np.asarray(small), focal, -0.15, cut)).save(
+            folder / f"{file.stem}.png"
+        )
     shutil.copy(folder / f"{files[0].stem}.png", folder / "copy.png")
     code, model, config = posed(folder, tmp_path / "model")
     assert code == 0 and len(model.names) == 12
@@ -179,15 +226,22 @@ def test_poses_and_the_lens_of_photos_are_found_and_what_it_bends_is_undone(tmp_
     assert capture.points is not None and len(capture.tracks) > len(capture.points)
     given = {frame["file_path"].split("/")[-1].split(".")[0]: np.array(frame["transform_matrix"])
              for frame in json.loads((data("fox") / "transforms.json").read_text())["frames"]}  # fmt: skip
-    true = np.linalg.inv(np.stack([given[name] @ np.diag([1, -1, -1, 1]) for name in capture.names]))
+    true = np.linalg.inv(
+        np.stack([given[name] @ np.diag([1, -1, -1, 1]) for name in capture.names])
+    )
     scale, rotation, shift = alignment(capture.cam_from_world, true)
     there = scale * centers(capture.cam_from_world) @ rotation.T + shift
     away = np.linalg.norm(there - centers(true), axis=1)
-    assert np.median(away) < 0.03 * np.linalg.norm(centers(true) - centers(true).mean(0), axis=1).mean()
+    assert (
+        np.median(away)
+        < 0.03 * np.linalg.norm(centers(true) - centers(true).mean(0), axis=1).mean()
+    )
 
 
 def bent(pixels, focal, k, cut):
-    """A pinhole picture u8 [H, W, 3] of a focal length as a lens of this k sees it, borders cut off."""
+    """A pinhole picture u8 [H, W, 3] of a focal length as a lens of this k sees it, borders cut
+    off.
+    """
     from scipy.ndimage import map_coordinates
 
     height, width = pixels.shape[:2]
@@ -199,7 +253,9 @@ def bent(pixels, focal, k, cut):
         straight = flat / (1 + k * straight**2)
     grow = np.where(flat > 0, straight / np.maximum(flat, 1e-12), 1)
     at = [y * grow * focal + height / 2 - 0.5, x * grow * focal + width / 2 - 0.5]
-    return np.stack([map_coordinates(pixels[..., c], at, order=1, mode="nearest") for c in range(3)], -1)
+    return np.stack(
+        [map_coordinates(pixels[..., c], at, order=1, mode="nearest") for c in range(3)], -1
+    )
 
 
 def plain_photos(folder):
@@ -214,11 +270,15 @@ def one_photo_in_copies(folder):
 
 def turned_on_the_spot(folder):
     """Views of one panorama."""
-    whole = np.asarray(Image.open(min((data("captures") / "flat360/images").iterdir())).convert("RGB"))
+    whole = np.asarray(
+        Image.open(min((data("captures") / "flat360/images").iterdir())).convert("RGB")
+    )
     for k in range(10):
         camera = Camera("EQUIRECTANGULAR", (1600.0, 800.0), 1600, 800, turn=45.0 + 9 * k)
         view = assembly.geometry(camera, 640)
-        pixels = assembly.resampled(Image.fromarray(whole), camera, view, assembly.positions(camera, view))
+        pixels = assembly.resampled(
+            Image.fromarray(whole), camera, view, assembly.positions(camera, view)
+        )
         Image.fromarray(pixels).save(folder / f"{k}.png")
 
 
@@ -244,14 +304,18 @@ def test_two_rooms_in_one_folder_are_told_apart(tmp_path):
                     tmp_path / f"photos/{room}{k}.png"
                 )
     code, model, _ = posed(tmp_path / "photos", tmp_path / "model")
-    assert code == 4 or any("groups" in doubt or "could not be placed" in doubt for doubt in model.judged["doubts"])
+    assert code == 4 or any(
+        "groups" in doubt or "could not be placed" in doubt for doubt in model.judged["doubts"]
+    )
 
 
 @pytest.mark.data
 @pytest.mark.slow
 @pytest.mark.xdist_group("sfm")
 @pytest.mark.parametrize(("name", "least"), [("goproboard", 18), ("flat360", 10)])
-def test_fisheyes_and_photos_of_all_directions_are_posed_without_a_word_about_their_lens(name, least, tmp_path):
+def test_fisheyes_and_photos_of_all_directions_are_posed_without_a_word_about_their_lens(
+    name, least, tmp_path
+):
     code, model, _ = posed(data("captures") / name / "images", tmp_path / "model")
     assert code == 0 and len(model.names) >= least
     assert artifact.read_manifest(tmp_path / "model").facts["n_registered"] == len(model.names)

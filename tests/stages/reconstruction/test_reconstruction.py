@@ -49,7 +49,9 @@ def test_normals_face_a_camera_and_covariances_are_anisotropic(triangulated):
 
 
 def test_poses_that_do_not_fit_make_no_lines_to_match_along(triangulated, tmp_path):
-    turned = points_of(tmp_path, "transforms", data("fox"), 12, {"disturb_degrees": 1.0}, poses="given")
+    turned = points_of(
+        tmp_path, "transforms", data("fox"), 12, {"disturb_degrees": 1.0}, poses="given"
+    )
     facts = artifact.read_manifest(tmp_path / "transforms-points").facts
     assert "n_matches_along_lines" not in facts
     assert facts["epipolar_px"] > 0.5
@@ -69,7 +71,11 @@ def test_few_neighbours_by_pose_are_enough_and_counted(triangulated, tmp_path):
 def test_points_and_tracks_of_a_colmap_model_are_taken_and_nothing_is_matched(tmp_path):
     found = points_of(tmp_path, "colmap", data("statue_colmap") / "dense/0", 23, dense="off")
     facts = artifact.read_manifest(tmp_path / "colmap-points").facts
-    assert facts["how"] == "source" and "feature matching" in facts["left_out"] and "n_pairs" not in facts
+    assert (
+        facts["how"] == "source"
+        and "feature matching" in facts["left_out"]
+        and "n_pairs" not in facts
+    )
     assert len(found.means) > 1000
     assert np.bincount(found.tracks[:, 0], minlength=len(found.means)).min() >= 1
     point, view = found.tracks.T

@@ -31,13 +31,21 @@ def test_the_first_of_each_cube_is_kept_in_order_wherever_the_grid_begins():
     points = np.random.default_rng(2).normal(size=(2000, 3)) * [3, 1, 0.2]
     for origin in (None, [0.1, -0.2, 0.3]):  # points on both sides of it
         seen: set = set()
-        place = np.floor((points - (points.min(0) if origin is None else origin)) / 0.25).astype(int).tolist()
-        wanted = [k for k, row in enumerate(place) if tuple(row) not in seen and not seen.add(tuple(row))]
+        place = (
+            np.floor((points - (points.min(0) if origin is None else origin)) / 0.25)
+            .astype(int)
+            .tolist()
+        )
+        wanted = [
+            k for k, row in enumerate(place) if tuple(row) not in seen and not seen.add(tuple(row))
+        ]
         assert first_of_each(points, 0.25, origin).tolist() == wanted
 
 
 def test_means_are_of_the_points_of_a_cube_that_holds_enough_of_them():
-    points = np.array([[0.1, 0, 0], [0.3, 0, 0], [0.2, 0.3, 0], [5, 0, 0], [0, 5, 0], [0, 5.5, 0], [0.5, 5, 0.5]])
+    points = np.array(
+        [[0.1, 0, 0], [0.3, 0, 0], [0.2, 0.3, 0], [5, 0, 0], [0, 5, 0], [0, 5.5, 0], [0.5, 5, 0.5]]
+    )
     cube = np.unique(cubes_of(points, 1.0), return_inverse=True)[1]
     kept, middles = means_of_each(cube, 0.5, points)
     assert kept.tolist() == [True, True, False]  # the last one has a single point
@@ -82,7 +90,13 @@ def test_points_of_one_colour_and_of_one_place():
 
 def cloud(places, colors):
     nothing = np.zeros((0, 2), np.int32)
-    return {"means": places, "colors": colors, "seen_from": np.zeros(len(places), int), "tracks": nothing, "notes": {}}
+    return {
+        "means": places,
+        "colors": colors,
+        "seen_from": np.zeros(len(places), int),
+        "tracks": nothing,
+        "notes": {},
+    }
 
 
 def test_an_even_part_of_what_follows_colours_is_found_again():
@@ -112,7 +126,11 @@ def test_colours_are_means_where_cubes_follow_them_and_a_points_own_elsewhere():
 
 @pytest.mark.parametrize(
     ("notes", "opacity"),
-    [({"how": "depth"}, 0.7), ({"how": "exhaustive", "n_from_depth": 5}, 0.7), ({"how": "source"}, 0.3)],
+    [
+        ({"how": "depth"}, 0.7),
+        ({"how": "exhaustive", "n_from_depth": 5}, 0.7),
+        ({"how": "source"}, 0.3),
+    ],
 )
 def test_gaussians_start_surer_where_depth_is_measured(notes, opacity):
     places, colors = wall(50)
@@ -122,8 +140,13 @@ def test_gaussians_start_surer_where_depth_is_measured(notes, opacity):
         ["a"], np.zeros((1, 3, 3)), np.zeros((1, 4, 4)), places, colors, np.zeros((50, 3)), shapes, nothing, notes
     )  # fmt: skip
     config = Config()
-    capture = SimpleNamespace(names=["a"], is_test=np.zeros(1, bool), size=(1, 1), depth=None, cam_from_world=None)
-    for wanted, train in ((opacity, config.train), (0.2, config.train.model_copy(update={"opacity": 0.2}))):
+    capture = SimpleNamespace(
+        names=["a"], is_test=np.zeros(1, bool), size=(1, 1), depth=None, cam_from_world=None
+    )
+    for wanted, train in (
+        (opacity, config.train),
+        (0.2, config.train.model_copy(update={"opacity": 0.2})),
+    ):
         train = resolved(train, evidence_of(train, capture, given, None))
         model = model_of(given, None, train, config.describe)
         assert model.raw["logit_opacities"].detach().sigmoid().numpy() == pytest.approx(wanted)

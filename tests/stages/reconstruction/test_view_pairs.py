@@ -1,4 +1,6 @@
-"""Pairs of views that are matched: near cameras, views in a row, views alike; each pair once, none of no use."""
+"""Pairs of views that are matched: near cameras, views in a row, views alike; each pair once, none
+of no use.
+"""
 
 import numpy as np
 import pytest
@@ -77,6 +79,9 @@ def test_nearest_never_pairs_what_has_no_finite_cost():
 
 def test_auto_follows_poses_and_count():
     assert matching_mode("auto", 1000, True) == "posed"
-    assert matching_mode("auto", FEW, False) == "exhaustive" and len(all_pairs(FEW)) == FEW * (FEW - 1) // 2
+    assert (
+        matching_mode("auto", FEW, False) == "exhaustive"
+        and len(all_pairs(FEW)) == FEW * (FEW - 1) // 2
+    )
     assert matching_mode("auto", FEW + 1, False) == "sequential"
     assert matching_mode("exhaustive", 1000, True) == "exhaustive"

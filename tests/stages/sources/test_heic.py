@@ -39,7 +39,8 @@ def test_orientation_and_focal_length_count_as_in_a_jpeg(tmp_path):
     assert common.detect(tmp_path) == "photos"
     fields = alone(tmp_path)
     assert fields["images"].shape == (3, 96, 64, 3)
-    assert fields["images"][0, 10, 50, 0] > 200 > 50 > fields["images"][0, 10, 10, 0]  # it was turned clockwise
+    # it was turned clockwise
+    assert fields["images"][0, 10, 50, 0] > 200 > 50 > fields["images"][0, 10, 10, 0]
     assert fields["Ks"][0, 0, 0] == pytest.approx(96 * 26 / 36)
     assert media_packages(photos.files(tmp_path)) == ("pillow_heif",)
 
@@ -48,7 +49,9 @@ def test_without_the_extra_a_heic_photo_is_one_line_that_installs_it(tmp_path, m
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     (tmp_path / "a.heic").write_bytes(HEADER)
     for read in (images.header, images.read_rgb, lambda path: media_packages([path])):
-        with pytest.raises(InputError, match=r"a\.heic is a HEIC photo.*pip install -e '\.\[heic\]'") as raised:
+        with pytest.raises(
+            InputError, match=r"a\.heic is a HEIC photo.*pip install -e '\.\[heic\]'"
+        ) as raised:
             read(tmp_path / "a.heic")
         assert raised.value.exit_code == 3 and "\n" not in str(raised.value)
     assert media_packages([image(tmp_path / "b.heic.png")]) == ()
@@ -56,23 +59,40 @@ def test_without_the_extra_a_heic_photo_is_one_line_that_installs_it(tmp_path, m
 
 def test_a_damaged_heic_is_named(tmp_path):
     whole = heic(tmp_path / "a.heic").read_bytes()
-    for content in (HEADER, whole[:100], whole[: len(whole) // 2], b"", b"text", whole[:60] + bytes(200)):
+    for content in (
+        HEADER,
+        whole[:100],
+        whole[: len(whole) // 2],
+        b"",
+        b"text",
+        whole[:60] + bytes(200),
+    ):
         (tmp_path / "a.heic").write_bytes(content)
-        with pytest.raises(InputError, match=r"a\.heic is (not a readable|no PNG, JPEG or HEIC) image"):
+        with pytest.raises(
+            InputError,
+            match=r"a\.heic is (not a readable|no PNG, JPEG or HEIC) "
+            r"image",
+        ):
             images.read_rgb(tmp_path / "a.heic")
 
 
 def textured(n, seed=0):
     rng = np.random.default_rng(seed)
-    return [zoom(rng.uniform(0, 255, (30, 40)), 4, order=1) + rng.uniform(0, 60, (120, 160)) for _ in range(n)]
+    return [
+        zoom(rng.uniform(0, 255, (30, 40)), 4, order=1) + rng.uniform(0, 60, (120, 160))
+        for _ in range(n)
+    ]
 
 
 def test_blur_is_told_from_plain_walls():
     views = textured(9)
-    views += [uniform_filter1d(views[0], 9, axis=1), 0.1 * views[1] + 100]  # moved, of little contrast
+    # moved, of little contrast
+    views += [uniform_filter1d(views[0], 9, axis=1), 0.1 * views[1] + 100]
     found = blurred(np.array([detail(view) for view in views]))
     assert np.flatnonzero(found).tolist() == [9]
-    assert not blurred(np.array([detail(uniform_filter1d(view, 9, axis=1)) for view in views[:9]])).any()
+    assert not blurred(
+        np.array([detail(uniform_filter1d(view, 9, axis=1)) for view in views[:9]])
+    ).any()
     assert not blurred(np.array([detail(np.zeros((2, 2))), detail(np.zeros((8, 8)))])).any()
 
 
@@ -83,7 +103,9 @@ def test_blurred_photos_are_counted_and_named():
     assert ingest.blur_note(fields) == ""  # most are alike
     stack = np.concatenate([stack[:3], stack[26:], uniform_filter1d(stack[:2], 15, axis=2)])
     fields = {"names": [f"v{k}" for k in range(9)], "images": stack.astype(np.uint8)}
-    assert ingest.blur_note(fields) == "2 of 9 views look blurred: v7, v8; they are used as they are."
+    assert ingest.blur_note(fields) == (
+        "2 of 9 views look blurred: v7, v8; they are used as they are."
+    )
 
 
 @pytest.mark.data

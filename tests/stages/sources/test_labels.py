@@ -1,4 +1,6 @@
-"""Label maps, whatever they are written as: each pixel's class is the one that was written, and a line says so."""
+"""Label maps, whatever they are written as: each pixel's class is the one that was written, and a
+line says so.
+"""
 
 import json
 import re
@@ -18,16 +20,20 @@ from chebsplat.stages.sources.common import Listing
 
 SETTINGS = IngestSection(min_views=2)
 NAMES = ["wall", "floor", "tv screen"]
-RGB = np.array([[255, 0, 0], [0, 200, 0], [7, 7, 200], [0, 0, 0]], np.uint8)  # the last: of no class
+# the last: of no class
+RGB = np.array([[255, 0, 0], [0, 200, 0], [7, 7, 200], [0, 0, 0]], np.uint8)
 CLASS = np.random.default_rng(0).integers(-1, 3, (3, 6, 8))
 CLASS[:, 0, :4] = [-1, 0, 1, 2]
 
 
 def source(folder, write, names=None, classes=CLASS, inner=""):
-    """Three views whose maps `write(path without an ending, class [6, 8])` writes; names of labels.json; `inner`: the
-    folder of the photos in images/.
+    """Three views whose maps `write(path without an ending, class [6, 8])` writes; names of
+    labels.json; `inner`: the folder of the photos in images/.
     """
-    fields = tiny() | {"names": [f"{inner}{name}" for name in "abc"], "labels": np.zeros((3, 6, 8), np.int16)}
+    fields = tiny() | {
+        "names": [f"{inner}{name}" for name in "abc"],
+        "labels": np.zeros((3, 6, 8), np.int16),
+    }
     layouts.write_colmap(folder, fields)
     shutil.rmtree(folder / "semantic")
     (folder / "semantic").mkdir()
@@ -61,17 +67,36 @@ WAYS = {
     "an array": (arrays(ONE, np.uint8), BY_ID, NAMES, "taken for ids with names"),
     "an array of floats": (arrays(ONE, np.float32), BY_ID, NAMES, "taken for ids with names"),
     "an array with -1": (arrays([0, 1, 2, -1]), BY_PLACE, NAMES, "with names"),
-    "names spelt in two ways": (pictures([1, 2, 3, 9]), BY_ID | {"9": " VOID "}, NAMES, "called VOID are void"),
-    "ids without names": (pictures(ONE), None, ["class_1", "class_2", "class_3"], r"no names.*; 0 \(\d.*none of"),
-    "255 for void": (pictures(ZERO), None, UNNAMED, r"255 \(\d.* is taken for void, and 0 for a class"),
-    "65535 for void": (pictures(CODE, np.uint16), None, UNNAMED, r"65535 \(\d.* is taken for void, and 0 for a class"),
+    "names spelt in two ways": (pictures([1, 2, 3, 9]), BY_ID | {"9": " VOID "}, NAMES, "called VOID are "
+                                                                                        ""
+                                                                                        ""
+                                                                                        "void"),
+    "ids without names": (pictures(ONE), None, ["class_1", "class_2", "class_3"], r"no names.*; 0 \(\d.*none "
+                                                                                  r""
+                                                                                  r""
+                                                                                  r"of"),
+    "255 for void": (pictures(ZERO), None, UNNAMED, r"255 \(\d.* is taken for void, and 0 for a "
+                                                    r"class"),
+    "65535 for void": (pictures(CODE, np.uint16), None, UNNAMED, r"65535 \(\d.* is taken for void, and 0 for a "
+                                                                 r""
+                                                                 r""
+                                                                 r"class"),
     "255 without a name": (pictures(ZERO), BY_PLACE, NAMES, r"without a name are ignored: 255 \(\d"),
     "colours": (pictures(RGB), None, HEX, r"taken for colours without names.*#000000 \(\d"),
-    "colours with names": (pictures(RGB), dict(zip(HEX, NAMES, strict=True)), NAMES, "taken for colours with names"),
+    "colours with names": (pictures(RGB), dict(zip(HEX, NAMES, strict=True)), NAMES, "taken for colours with "
+                                                                                     ""
+                                                                                     ""
+                                                                                     "names"),
     "transparent colours": (pictures(CLEAR), None, HEX, "taken for colours without names"),
     "grey colours": (pictures(GREY), BY_ID, NAMES, "taken for ids with names"),
-    "scores, classes last": (arrays(SCORES, np.float32), BY_PLACE, NAMES, "taken for scores by class with names"),
-    "scores, classes first": (arrays(SCORES, np.float32, FIRST), None, UNNAMED, "scores by class without names"),
+    "scores, classes last": (arrays(SCORES, np.float32), BY_PLACE, NAMES, "taken for scores by class with "
+                                                                          ""
+                                                                          ""
+                                                                          "names"),
+    "scores, classes first": (arrays(SCORES, np.float32, FIRST), None, UNNAMED, "scores by class without "
+                                                                                ""
+                                                                                ""
+                                                                                "names"),
     "one-hot": (arrays(SCORES, bool, FIRST), BY_PLACE, NAMES, "taken for scores by class"),
     "masks of a view": (masks(NAMES), None, NAMES, "taken for one mask a class"),
     "masks of a view as JPEG": (masks(NAMES, "jpg"), None, NAMES, "taken for one mask a class"),
@@ -90,7 +115,9 @@ def said(fields):
 
 
 @pytest.mark.parametrize("way", WAYS)
-def test_a_pixel_s_class_is_the_one_that_was_written_and_a_line_says_what_maps_were_taken_for(tmp_path, way):
+def test_a_pixel_s_class_is_the_one_that_was_written_and_a_line_says_what_maps_were_taken_for(
+    tmp_path, way
+):
     write, names, found, word = WAYS[way]
     fields = colmap.read(source(tmp_path, write, names), SETTINGS)
     check(fields, found)
@@ -102,11 +129,16 @@ def test_a_pixel_s_class_is_the_one_that_was_written_and_a_line_says_what_maps_w
 
 @pytest.mark.parametrize("inner", ["", "left/"])
 @pytest.mark.parametrize("shown", [("0", "0", "0"), ("0", "1", "2"), ("012", "0", "1")])
-def test_masks_in_folders_of_classes_are_told_from_ids_whatever_classes_a_view_shows(tmp_path, shown, inner):
+def test_masks_in_folders_of_classes_are_told_from_ids_whatever_classes_a_view_shows(
+    tmp_path, shown, inner
+):
     wanted = [
-        np.where(np.isin(of_view, [*map(int, of)]), of_view, -1) for of_view, of in zip(CLASS, shown, strict=True)
+        np.where(np.isin(of_view, [*map(int, of)]), of_view, -1)
+        for of_view, of in zip(CLASS, shown, strict=True)
     ]
-    fields = colmap.read(source(tmp_path, masks(NAMES, swapped=True), classes=wanted, inner=inner), SETTINGS)
+    fields = colmap.read(
+        source(tmp_path, masks(NAMES, swapped=True), classes=wanted, inner=inner), SETTINGS
+    )
     check(fields, NAMES, np.array(wanted))
     assert "taken for one mask a class" in said(fields)
 
@@ -143,7 +175,10 @@ def test_maps_lie_in_folders_of_other_names_and_beside_a_transforms_json(tmp_pat
     folder = source(tmp_path, pictures(ONE), BY_ID)
     (folder / "semantic").rename(folder / place)
     if kind == "transforms":
-        frames = [{"file_path": f"images/{name}.png", "transform_matrix": np.eye(4).tolist()} for name in "abc"]
+        frames = [
+            {"file_path": f"images/{name}.png", "transform_matrix": np.eye(4).tolist()}
+            for name in "abc"
+        ]
         (folder / "transforms.json").write_text(json.dumps({"fl_x": 10.0, "frames": frames}))
     module = {"colmap": colmap, "transforms": transforms}[kind]
     assert module.probe(folder)["labels"] and folder / place / "a.png" in module.files(folder)
@@ -184,8 +219,14 @@ def test_a_name_given_twice_in_other_letters_is_one_class(tmp_path):
 
 def test_a_lossy_map_and_a_picture_of_many_colours_are_refused(tmp_path):
     folder = source(tmp_path, pictures(ONE), BY_ID)
-    Image.fromarray(CLASS[1].astype(np.uint8)).save(folder / "semantic/b.png", format="JPEG", quality=100)
-    with pytest.raises(InputError, match=r"semantic/b\.png is a JPEG picture.*write label maps as PNG"):
+    Image.fromarray(CLASS[1].astype(np.uint8)).save(
+        folder / "semantic/b.png", format="JPEG", quality=100
+    )
+    with pytest.raises(
+        InputError,
+        match=r"semantic/b\.png is a JPEG picture.*write label maps as "
+        r"PNG",
+    ):
         colmap.read(folder, SETTINGS)
     listing = Listing("colmap", [], label_place="semantic", label_kinds={"a": labels.COLORS})
     with pytest.raises(InputError, match="holds 2000 colours"):
@@ -218,7 +259,9 @@ UNTOLD = ["class_1", "class_2", "class_25"]
     ],
 )
 @pytest.mark.parametrize("place", ["label", "semantics"])
-def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(tmp_path, write, beside, found, kind, place):
+def test_scannets_own_export_needs_no_points_and_its_label_folder_is_read(
+    tmp_path, write, beside, found, kind, place
+):
     fields = tiny() | {"class_names": NAMES, "labels": CLASS}
     fields["Ks"][:, 0, 2] += 0.5  # as written, half of these few pixels
     layouts.write_scannet(tmp_path, fields)

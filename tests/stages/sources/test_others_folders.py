@@ -1,4 +1,6 @@
-"""Folders as other programs and people leave them: the photos, cameras and depth that are meant are found, and said."""
+"""Folders as other programs and people leave them: the photos, cameras and depth that are meant are
+found, and said.
+"""
 
 import shutil
 
@@ -36,7 +38,9 @@ def test_photos_under_other_names_are_those_of_the_model_where_only_one_fits(tmp
         pycolmap.Reconstruction(folder / "sparse/0").write_binary(folder / "sparse/0")
     fields = colmap.read(folder, SETTINGS)
     assert len(fields["names"]) == 3
-    for name, pixels, pose in zip(fields["names"], fields["images"], fields["cam_from_world"], strict=True):
+    for name, pixels, pose in zip(
+        fields["names"], fields["images"], fields["cam_from_world"], strict=True
+    ):
         k = [common.stem(new) for new in names.values()].index(name)
         assert abs(int(pixels[0, 0, 0]) - 10 * k) < 3 and pose[0, 3] == k
 
@@ -55,11 +59,15 @@ def test_photos_that_fit_two_names_are_none_and_a_message_shows_three_of_each_si
 
 @pytest.mark.parametrize("form", ["bin", "txt"])
 @pytest.mark.parametrize(("root", "sizes"), [("sparse", [2, 4, 3]), ("colmap/sparse", [3, 4])])
-def test_the_largest_of_several_models_is_taken_and_the_others_are_named(tmp_path, root, sizes, form):
+def test_the_largest_of_several_models_is_taken_and_the_others_are_named(
+    tmp_path, root, sizes, form
+):
     import pycolmap
 
     for number, size in enumerate(sizes):
-        made = write_colmap(tmp_path / f"made{number}", names=tuple(f"{k}.png" for k in range(size)))
+        made = write_colmap(
+            tmp_path / f"made{number}", names=tuple(f"{k}.png" for k in range(size))
+        )
         (tmp_path / "scene" / root).mkdir(parents=True, exist_ok=True)
         shutil.copytree(made / "sparse/0", tmp_path / f"scene/{root}/{number}")
         if form == "bin":
@@ -70,7 +78,9 @@ def test_the_largest_of_several_models_is_taken_and_the_others_are_named(tmp_pat
     fields = colmap.read(tmp_path / "scene", SETTINGS)
     assert len(fields["names"]) == 4
     told = next(note for note in fields["source"]["notes"] if note.startswith("The largest model"))
-    assert told.startswith(f"The largest model is taken, {root}/1 (4 images); left out: {root}/0 ({sizes[0]} images)")
+    assert told.startswith(
+        f"The largest model is taken, {root}/1 (4 images); left out: {root}/0 ({sizes[0]} images)"
+    )
 
 
 @pytest.mark.parametrize(("place", "camera", "K"), [
@@ -78,7 +88,8 @@ def test_the_largest_of_several_models_is_taken_and_the_others_are_named(tmp_pat
     ("images", "PINHOLE 640 480 500 510 320.5 240.5", [125, 127.5, 80.125, 60.125]),
     ("images_2", "SIMPLE_PINHOLE 1280 960 1000 640 480", [125, 125, 80, 60]),
     ("input", "PINHOLE 160 120 125 125 80 60", [125, 125, 80, 60]),
-    ("images", "PINHOLE 480 640 510 500 240 320", [125, 127.5, 80, 60]),  # not turned: another shape
+    # not turned: another shape
+    ("images", "PINHOLE 480 640 510 500 240 320", [125, 127.5, 80, 60]),
 ])  # fmt: skip
 def test_cameras_are_scaled_to_photos_that_were_reduced_later(tmp_path, place, camera, K):
     folder = write_colmap(tmp_path, camera)
@@ -117,9 +128,15 @@ def test_points_whose_error_is_not_known_are_taken(tmp_path):
     rng = np.random.default_rng(0)
     tracks = np.stack([np.repeat(np.arange(150), 3), np.tile(np.arange(3), 150)], 1)
     errors = np.where(np.arange(150) < 120, np.nan, np.where(np.arange(150) < 140, -1.0, 9.0))
-    cloud = colmap_model.Cloud(rng.normal(size=(150, 3)), np.zeros((150, 3), np.uint8), errors, tracks)
+    cloud = colmap_model.Cloud(
+        rng.normal(size=(150, 3)), np.zeros((150, 3), np.uint8), errors, tracks
+    )
     notes = []
-    fields = {"names": list("abc"), "cam_from_world": np.tile(np.eye(4), (3, 1, 1)), "source": {"notes": notes}}
+    fields = {
+        "names": list("abc"),
+        "cam_from_world": np.tile(np.eye(4), (3, 1, 1)),
+        "source": {"notes": notes},
+    }
     found = colmap.points_of(cloud, list("abc"), fields)
     assert len(found["points"]) == 140 and notes[0].startswith("10 of the model's 150 points")
     cloud.errors[:] = 9
@@ -139,9 +156,13 @@ def test_points_and_depth_in_empty_space_are_left_out(tmp_path):
     assert np.allclose(fields["depth"][:, :, 40:], 1.5) and (fields["labels"][:, :, 40:] == 0).all()
     shutil.rmtree(folder / "depth")
     rng = np.random.default_rng(0)
-    rows = [f"{k} {rng.uniform(4, 8) * (-1) ** k} {rng.uniform(-2, 2)} 30 9 9 9 .5" for k in range(300)]
+    rows = [
+        f"{k} {rng.uniform(4, 8) * (-1) ** k} {rng.uniform(-2, 2)} 30 9 9 9 .5" for k in range(300)
+    ]
     (folder / "sparse/0/points3D.txt").write_text("\n".join(rows))
-    poses = "".join(f"{k + 1} 1 0 0 0 {0.1 * k} 0 0 1 {name}.png\n\n" for k, name in enumerate("abc"))
+    poses = "".join(
+        f"{k + 1} 1 0 0 0 {0.1 * k} 0 0 1 {name}.png\n\n" for k, name in enumerate("abc")
+    )
     (folder / "sparse/0/images.txt").write_text(poses)
     fields = colmap.read(folder, SETTINGS)
     assert len(fields["points"]) == 150 and (fields["points"][:, 0] > 0).all()

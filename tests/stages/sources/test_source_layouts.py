@@ -39,7 +39,9 @@ def scene():
 
 
 def with_classes(scene, names):
-    """The scene with its k-th class called by the (k + 7)-th of `names`, so that shelves and counter are among them."""
+    """The scene with its k-th class called by the (k + 7)-th of `names`, so that shelves and
+    counter are among them.
+    """
     return scene | {"labels": np.where(scene["labels"] < 0, -1, (scene["labels"] + 7) % len(names)).astype(np.int16),
                     "class_names": list(names)}  # fmt: skip
 
@@ -95,7 +97,9 @@ def test_deep_blending_or_any_colmap_folder(scene, tmp_path):
 
 @pytest.mark.parametrize("unknown", [0, 65_535])
 def test_seven_scenes(scene, tmp_path, unknown):
-    """Depth and poses are of a camera beside the photo's; no file of the layout is of the photo's."""
+    """Depth and poses are of a camera beside the photo's; no file of the layout is of the
+    photo's.
+    """
     photo, depth = (78.9, 48.465, 35.535), (87.75, 48, 36)
     Ks = np.array([[[f, 0, cx], [0, f, cy], [0, 0, 1]] for f, cx, cy in (photo, depth)])
     beside = scene["cam_from_world"].copy()
@@ -172,7 +176,8 @@ def test_frames_that_no_list_of_a_split_names_are_left_out_and_counted(scene, tm
 
 def test_scannets_own_labels_are_reduced_and_corrected_by_object(scene, tmp_path):
     scene = with_classes(scene, scannet_closed.CLASSES)
-    objects = np.where(scene["labels"] == 7, 6, 9)  # doors are object 6, which this scene's correction makes a table
+    # doors are object 6, which this scene's correction makes a table
+    objects = np.where(scene["labels"] == 7, 6, 9)
     layouts.write_scannet_pl(tmp_path / "scene0423_02", scene, folded=False, objects=objects)
     shutil.copytree(tmp_path / "scene0423_02", tmp_path / "scene0000_00")
     compare(read(tmp_path / "scene0000_00", "scannet"), scene)
@@ -218,7 +223,9 @@ def test_frames_without_a_pose_are_left_out_and_counted(scene, tmp_path):
     found = read(tmp_path, "scannet")
     assert found["names"][:5] == ["0", "10", "20", "40", "60"]
     assert "1 poses have no image" in found["source"]["notes"][1]
-    assert any("1 of 15 frames have a pose that is not finite" in note for note in found["source"]["notes"])
+    assert any(
+        "1 of 15 frames have a pose that is not finite" in note for note in found["source"]["notes"]
+    )
 
 
 def test_intrinsics_of_the_whole_sensor_and_labels_of_its_size_fit_reduced_images(tmp_path):
@@ -239,7 +246,9 @@ def test_intrinsics_of_the_whole_sensor_and_labels_of_its_size_fit_reduced_image
 
 
 def test_depth_of_another_camera_is_looked_up_through_both_cameras(scene, tmp_path):
-    """A depth camera of half the resolution and two thirds of the focal length sees more than the photo."""
+    """A depth camera of half the resolution and two thirds of the focal length sees more than the
+    photo.
+    """
     layouts.write_scannet_pl(tmp_path, with_classes(scene, scannet_closed.CLASSES))
     K = np.eye(4)
     K[:2, :3] = [[44.0, 0, 47.5], [0, 44.0, 35.5]]
@@ -254,7 +263,9 @@ def test_depth_of_another_camera_is_looked_up_through_both_cameras(scene, tmp_pa
 
 
 @pytest.mark.parametrize(("metres", "first", "last"), [(1, 3, 88), (10, 5, 90)])
-def test_depth_of_seven_scenes_sees_less_than_the_photo_beside(scene, tmp_path, metres, first, last):
+def test_depth_of_seven_scenes_sees_less_than_the_photo_beside(
+    scene, tmp_path, metres, first, last
+):
     layouts.write_seven_scenes(tmp_path, scene)
     (tmp_path / "camera-intrinsics.txt").unlink()
     for k in range(16):
@@ -274,16 +285,25 @@ SAYING_NOTHING = {
     "white": lambda seen: 0 * seen + 255,
     "one colour": lambda seen: 0 * seen + np.array([7, 200, 7], np.uint8),
     "0 and 1 for 0 and 255": lambda seen: (seen > 127).astype(np.uint8),
-    "at random": lambda seen: np.random.default_rng(0).integers(0, 256, seen.shape).astype(np.uint8),
-    "black but for a few": lambda seen: seen * (np.arange(len(seen))[:, None] < 10).astype(np.uint8),
+    "at random": lambda seen: (
+        np.random.default_rng(0).integers(0, 256, seen.shape).astype(np.uint8)
+    ),
+    "black but for a few": lambda seen: (
+        seen * (np.arange(len(seen))[:, None] < 10).astype(np.uint8)
+    ),
 }
 
 
 @pytest.mark.parametrize("colors", ["theirs", *SAYING_NOTHING])
-def test_a_sources_own_points_become_the_scenes_and_their_colours_where_these_tell_something(scene, tmp_path, colors):
+def test_a_sources_own_points_become_the_scenes_and_their_colours_where_these_tell_something(
+    scene, tmp_path, colors
+):
     """All but five lie on what the views show. Theirs: what is shown, darker by 3."""
     pixels = np.argwhere(np.ones((72, 96), bool))[::23]
-    parts = [unproject(scene["depth"][k], scene["Ks"][k], scene["cam_from_world"][k], pixels) for k in range(0, 16, 4)]
+    parts = [
+        unproject(scene["depth"][k], scene["Ks"][k], scene["cam_from_world"][k], pixels)
+        for k in range(0, 16, 4)
+    ]
     points = np.concatenate([*parts, np.full((5, 3), 50.0)]).astype(np.float32)
     shown = [scene["images"][k][pixels[:, 0], pixels[:, 1]] for k in range(0, 16, 4)]
     shown = np.concatenate([*shown, np.zeros((5, 3), np.uint8)])[np.isfinite(points).all(1)]
@@ -303,7 +323,8 @@ def test_a_sources_own_points_become_the_scenes_and_their_colours_where_these_te
     row = {tuple(point): k for k, point in enumerate(points.tolist())}
     rows = [row[tuple(point)] for point in found.means.tolist()]
     apart = np.abs(found.colors - (theirs if colors == "theirs" else shown)[rows].astype(float))
-    assert not apart.any() if colors == "theirs" else np.median(apart) < 4  # where no wall hides a point
+    # where no wall hides a point
+    assert not apart.any() if colors == "theirs" else np.median(apart) < 4
     to_eyes = centers(scene["cam_from_world"])[None] - found.means[:, None]
     facing = (np.einsum("ni,nvi->nv", found.normals, to_eyes) > 0).mean()
     assert facing > 0.8  # most points of a convex room are turned towards most cameras
@@ -311,9 +332,14 @@ def test_a_sources_own_points_become_the_scenes_and_their_colours_where_these_te
 
 def test_points_that_no_view_has_in_its_image_are_too_few_with_depth_too(scene, tmp_path, capfd):
     fields = {key: scene[key] for key in ("names", "images", "Ks", "cam_from_world", "depth")}
-    record = Capture(**fields, is_test=np.arange(16) % 8 == 0, points=np.full((50, 3), 50, np.float32))
+    record = Capture(
+        **fields, is_test=np.arange(16) % 8 == 0, points=np.full((50, 3), 50, np.float32)
+    )
     inputs = {"capture": published(tmp_path / "c", record)}
-    assert run_stage("sfm", tmp_path / "out", inputs, {"sfm": {"dense": "off"}}) == DataFailure.exit_code
+    assert (
+        run_stage("sfm", tmp_path / "out", inputs, {"sfm": {"dense": "off"}})
+        == DataFailure.exit_code
+    )
     assert "only 0 points were found" in capfd.readouterr().err
 
 
@@ -325,6 +351,10 @@ def test_the_red_kitchens_depth_agrees_between_views():
     fields = seven_scenes.read(folder, IngestSection(max_side=80, max_views=60))
     fields["labels"] = np.zeros(fields["depth"].shape, int)
     shares = [agreement(fields, k, k + 1)[0] for k in range(0, 59, 6)]
-    assert min(shares) > 0.3  # of all pixels, 80 % of which have depth; 0.38 where the camera turns fastest
+    # of all pixels, 80 % of which have depth; 0.38 where the camera turns fastest
+    assert min(shares) > 0.3
     fields["cam_from_world"] = np.linalg.inv(fields["cam_from_world"])
-    assert np.median([agreement(fields, k, k + 1)[0] for k in range(0, 59, 6)]) < np.median(shares) - 0.1
+    assert (
+        np.median([agreement(fields, k, k + 1)[0] for k in range(0, 59, 6)])
+        < np.median(shares) - 0.1
+    )

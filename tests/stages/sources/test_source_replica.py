@@ -1,4 +1,6 @@
-"""Both renderings of Replica become the same capture; rows of a trajectory belong to the frames they count."""
+"""Both renderings of Replica become the same capture; rows of a trajectory belong to the frames
+they count.
+"""
 
 import numpy as np
 import pytest

@@ -1,4 +1,6 @@
-"""COLMAP models and photos become pinhole views of one size, and nothing vanishes without a note."""
+"""COLMAP models and photos become pinhole views of one size, and nothing vanishes without a
+note.
+"""
 
 import json
 from types import SimpleNamespace
@@ -37,21 +39,29 @@ def test_a_colmap_text_model_with_depth_and_labels_reads(tmp_path):
     assert [int(v[0, 0]) for v in fields["labels"]] == [0, -1, 0]
     assert fields["cam_from_world"][2][0, 3] == 2
     assert len(colmap.files(folder)) == 3 + 1 + 9
-    dtypes = {k: str(fields[k].dtype) for k in ("images", "Ks", "cam_from_world", "depth", "labels")}
+    dtypes = {
+        k: str(fields[k].dtype) for k in ("images", "Ks", "cam_from_world", "depth", "labels")
+    }
     assert list(dtypes.values()) == ["uint8", "float64", "float64", "float32", "int16"]
 
 
 def fine_and_coarse(width, height):
-    """Stripes a pixel wide of ± 30 grey values, a variance of 900, over steps of 32 pixels of ± 30."""
+    """Stripes a pixel wide of ± 30 grey values, a variance of 900, over steps of 32 pixels of ±
+    30.
+    """
     x = np.tile(np.arange(width), (height, 1))
     grey = 128 + 30 * (2 * (x % 2) - 1) + 30 * (2 * (x // 32 % 2) - 1)
     return np.repeat(grey.astype(np.uint8)[..., None], 3, 2)
 
 
 @pytest.mark.parametrize(("max_side", "kept"), [(256, 1.0), (640, 1.0), (128, 0.5)])
-def test_reduced_photos_keep_the_variance_that_is_coarser_than_their_pixels(tmp_path, max_side, kept):
+def test_reduced_photos_keep_the_variance_that_is_coarser_than_their_pixels(
+    tmp_path, max_side, kept
+):
     Image.fromarray(fine_and_coarse(256, 64)).save(tmp_path / "a.png")
-    frame = common.Frame("a", tmp_path / "a.png", Camera("PINHOLE", (200.0, 200.0, 128.0, 32.0), 256, 64))
+    frame = common.Frame(
+        "a", tmp_path / "a.png", Camera("PINHOLE", (200.0, 200.0, 128.0, 32.0), 256, 64)
+    )
     settings = IngestSection(min_views=1, max_side=max_side)
     fields = assembly.assemble(common.Listing("photos", [frame], upright=True), settings)
     assert fields["variance_kept"] == pytest.approx(kept, abs=1e-6)
@@ -69,7 +79,12 @@ def test_variance_is_compared_over_the_part_of_a_photo_that_a_view_shows(tmp_pat
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
 def test_models_that_colmap_writes_today_read(tmp_path, suffix):
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 2, 3, 20
+    (
+        options.num_rigs,
+        options.num_cameras_per_rig,
+        options.num_frames_per_rig,
+        options.num_points3D,
+    ) = 1, 2, 3, 20
     model = pycolmap.synthesize_dataset(options)
     place = tmp_path / "sparse/0"
     place.mkdir(parents=True)
@@ -106,9 +121,13 @@ KEYPOINTS = "3 4 -1 5 6 -1 7 8 1 2 3 -1"  # 12 numbers: more words than an image
     [" # none", "", "  "], [f"# of a\n{KEYPOINTS}", "#", KEYPOINTS], ["1.5 2.5 -1\n\n # end", "\n", None],
 ])  # fmt: skip
 def test_no_view_of_a_text_model_is_lost_whatever_follows_it(tmp_path, between):
-    """Keypoints, an empty line, a comment, or nothing at all, as scripts that thin out a model leave it."""
+    """Keypoints, an empty line, a comment, or nothing at all, as scripts that thin out a model
+    leave it.
+    """
     lines = ["#IMAGE_ID, ...", " # thinned"]
-    lines += [part for pair in zip(IMAGES, between, strict=True) for part in pair if part is not None]
+    lines += [
+        part for pair in zip(IMAGES, between, strict=True) for part in pair if part is not None
+    ]
     write_colmap(tmp_path)
     (tmp_path / "sparse/0/cameras.txt").write_text("1.0 PINHOLE 320.0 240.0 200 200 160 120\n")
     (tmp_path / "sparse/0/images.txt").write_text("\n".join(lines))
@@ -122,12 +141,19 @@ def test_no_view_of_a_text_model_is_lost_whatever_follows_it(tmp_path, between):
 def test_bytes_after_a_models_last_record_are_counted(tmp_path):
     """As COLMAP's own reader, which passes over them."""
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 1, 4, 9
+    (
+        options.num_rigs,
+        options.num_cameras_per_rig,
+        options.num_frames_per_rig,
+        options.num_points3D,
+    ) = 1, 1, 4, 9
     pycolmap.synthesize_dataset(options).write_binary(tmp_path)
     with (tmp_path / "images.bin").open("ab") as stream:
         stream.write(b"ended")
     found, theirs = colmap_model.read_model(tmp_path), pycolmap.Reconstruction(tmp_path)
-    assert {image.name for image in found.images} == {image.name for image in theirs.images.values()}
+    assert {image.name for image in found.images} == {
+        image.name for image in theirs.images.values()
+    }
     assert found.notes == ("5 bytes follow the last record of images.bin and are not read.",)
 
 
@@ -145,7 +171,9 @@ LENSES = {
 @pytest.mark.parametrize("suffix", ["bin", "txt"])
 @pytest.mark.parametrize("lens", LENSES)
 def test_every_lens_that_colmap_writes_is_undone(tmp_path, lens, suffix):
-    """Photos whose value is their own coordinate: pycolmap says where each of our pixels lies in them."""
+    """Photos whose value is their own coordinate: pycolmap says where each of our pixels lies in
+    them.
+    """
     if not hasattr(pycolmap.CameraModelId, lens):
         pytest.skip(f"this pycolmap has no {lens}")
     camera = pycolmap.Camera(camera_id=1, model=lens, width=240, height=180, params=LENSES[lens])
@@ -157,11 +185,18 @@ def test_every_lens_that_colmap_writes_is_undone(tmp_path, lens, suffix):
         ys, xs = np.mgrid[:180, :240]
         save(tmp_path / f"images/{k}.png", np.stack([xs, ys, 0 * xs], -1).astype(np.uint8))
     (tmp_path / "sparse/0").mkdir(parents=True)
-    model.write_text(tmp_path / "sparse/0") if suffix == "txt" else model.write_binary(tmp_path / "sparse/0")
+    model.write_text(tmp_path / "sparse/0") if suffix == "txt" else model.write_binary(
+        tmp_path / "sparse/0"
+    )
     fields = colmap.read(tmp_path, IngestSection(max_side=400))
     height, width = fields["images"].shape[1:3]
-    pixels = np.stack([*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), np.ones((height, width))], -1)
-    at = camera.img_from_cam(pixels.reshape(-1, 3) @ np.linalg.inv(fields["Ks"][0]).T).reshape(height, width, 2)
+    pixels = np.stack(
+        [*np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), np.ones((height, width))],
+        -1,
+    )
+    at = camera.img_from_cam(pixels.reshape(-1, 3) @ np.linalg.inv(fields["Ks"][0]).T).reshape(
+        height, width, 2
+    )
     inner = np.s_[3:-3, 3:-3]
     found = fields["images"][0, ..., :2] + 0.5
     assert np.abs(found - at)[inner].max() < 1
@@ -169,25 +204,39 @@ def test_every_lens_that_colmap_writes_is_undone(tmp_path, lens, suffix):
 
 def cloud_of(rng, n, n_views, length):
     """A model's cloud of points near the origin, each seen by `length` of its images."""
-    views = np.concatenate([rng.choice(n_views, length, replace=False) for _ in range(n)]) if length else []
+    views = (
+        np.concatenate([rng.choice(n_views, length, replace=False) for _ in range(n)])
+        if length
+        else []
+    )
     tracks = np.stack([np.repeat(np.arange(n), length), views], 1).astype(int)
-    return colmap_model.Cloud(rng.normal(size=(n, 3)), np.zeros((n, 3), np.uint8), np.ones(n), tracks)
+    return colmap_model.Cloud(
+        rng.normal(size=(n, 3)), np.zeros((n, 3), np.uint8), np.ones(n), tracks
+    )
 
 
 @pytest.mark.parametrize(("length", "n_kept"), [(0, 150), (2, 0), (4, 150)])
 def test_points_that_enough_images_see_are_taken_and_those_without_any_tracks(length, n_kept):
     cloud = cloud_of(np.random.default_rng(0), 150, 6, length)
     notes = []
-    given = {"names": list("abcd"), "cam_from_world": np.tile(np.eye(4), (4, 1, 1)), "source": {"notes": notes}}
+    given = {
+        "names": list("abcd"),
+        "cam_from_world": np.tile(np.eye(4), (4, 1, 1)),
+        "source": {"notes": notes},
+    }
     fields = colmap.points_of(cloud, list("fedcba"), given)
     assert len(fields.get("points", ())) == n_kept
     if length == 4:
         point, view = fields["tracks"].T
         expected = {(p, "abcdef"[5 - v]) for p, v in cloud.tracks.tolist() if 5 - v < 4}
-        assert {(p, "abcd"[v]) for p, v in zip(point.tolist(), view.tolist(), strict=True)} == expected
+        assert {
+            (p, "abcd"[v]) for p, v in zip(point.tolist(), view.tolist(), strict=True)
+        } == expected
         cloud.errors[:20] = 9
         few = colmap.points_of(cloud, list("fedcba"), given)
-        assert len(few["points"]) == 130 and notes[0].startswith("20 of the model's 150 points are left out")
+        assert len(few["points"]) == 130 and notes[0].startswith(
+            "20 of the model's 150 points are left out"
+        )
         assert few["tracks"][:, 0].max() < 130
 
 
@@ -241,22 +290,35 @@ def test_undistortion_follows_the_polynomial_for_images_depth_and_labels(tmp_pat
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     K = fields["Ks"][0]
     u, v = (x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]
-    second, p1, p2 = {"SIMPLE_RADIAL": (0, 0, 0), "RADIAL": (0.05, 0, 0), "OPENCV": (0.05, 0.002, -0.003)}[model]
+    second, p1, p2 = {
+        "SIMPLE_RADIAL": (0, 0, 0),
+        "RADIAL": (0.05, 0, 0),
+        "OPENCV": (0.05, 0.002, -0.003),
+    }[model]
     r2 = u * u + v * v
     radial = 1 + k * r2 + second * r2 * r2
-    u, v = (u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v))
+    u, v = (
+        u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u),
+        v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v),
+    )
     at_x, at_y = FOCAL * u + 120, FOCAL * v + 90  # photo pixels
-    # Averaging and bilinear sampling of a ramp are exact inside; at the border they clamp to the last pixel.
+    # Averaging and bilinear sampling of a ramp are exact inside; at the border they clamp to the
+    # last pixel.
     inner = np.s_[2:-2, 2:-2]
     assert np.abs(fields["images"][0, ..., 0] + 0.5 - at_x)[inner].max() < 1.5
     assert np.abs(fields["images"][0, ..., 1] + 0.5 - at_y)[inner].max() < 1.5
     assert np.abs((fields["depth"][0] - 1) * 1000 + 0.5 - at_x)[inner].max() < 0.51
-    ids = np.array([int(name.removeprefix("class_")) for name in fields["class_names"]])[fields["labels"][0]]
+    ids = np.array([int(name.removeprefix("class_")) for name in fields["class_names"]])[
+        fields["labels"][0]
+    ]
     whole = np.abs((at_y + 10) % 20 - 10) > 0.01  # off the edges of stripes
     assert (ids == np.floor(at_y / 20) + 1)[inner][whole[inner]].all()
 
 
-STRAIGHT = ["SIMPLE_RADIAL 80 60 50 40.3 29.6 0", "RADIAL 80 60 50 40 30 0 0", "OPENCV 80 60 50 51 40 30 0 0 0 0",
+STRAIGHT = ["SIMPLE_RADIAL 80 60 50 40.3 29.6 0", "RADIAL 80 60 50 40 30 0 0", "OPENCV 80 60 50 51 40 30 0 0 0 "
+                                                                               ""
+                                                                               ""
+                                                                               "0",
             "OPENCV 80 60 50 50 40 30 1e-5 -2e-5 1e-6 0"]  # fmt: skip
 
 
@@ -270,13 +332,19 @@ def test_a_lens_that_bends_nothing_leaves_every_pixel_as_it_is(tmp_path, line):
     params = [float(value) for value in line.split()[3:]]
     focal = params[:2] if line.startswith("OPENCV") else [params[0]] * 2
     centre = params[2:4] if line.startswith("OPENCV") else params[1:3]
-    assert fields["Ks"][0].tolist() == [[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]]
+    assert fields["Ks"][0].tolist() == [
+        [focal[0], 0, centre[0]],
+        [0, focal[1], centre[1]],
+        [0, 0, 1],
+    ]
     assert "undistorted" not in str(fields["source"])
 
 
 @pytest.mark.parametrize("k", [-0.1, 0.01, 0.1])
 def test_where_a_lens_bends_nothing_pixels_stay_and_the_scale_too(tmp_path, k):
-    """At the principal point: the view's pixel is the photo's there, and its focal length that of the photo."""
+    """At the principal point: the view's pixel is the photo's there, and its focal length that of
+    the photo.
+    """
     folder = write_colmap(tmp_path, f"SIMPLE_RADIAL 80 60 90 40.3 29.6 {k}")
     noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3)).astype(np.uint8)
     save(folder / "images/a.png", noise)
@@ -286,36 +354,52 @@ def test_where_a_lens_bends_nothing_pixels_stay_and_the_scale_too(tmp_path, k):
     moved = K[:2, 2] - [40.3, 29.6]
     assert np.allclose(moved, moved.round())
     x, y = (int(v) for v in np.floor(K[:2, 2]))
-    assert np.abs(fields["images"][0, y, x].astype(int) - noise[29, 40]).max() <= 0.06 * 255  # splines of white noise
+    # splines of white noise
+    assert np.abs(fields["images"][0, y, x].astype(int) - noise[29, 40]).max() <= 0.06 * 255
     assert fields["source"]["undistorted"] == ["SIMPLE_RADIAL"]
 
 
 @pytest.mark.data
 @pytest.mark.parametrize("side", [160, 480, 640, 8192])
 @pytest.mark.parametrize(
-    "photo", ["fox/images/0012.jpg", "captures/kitchen/images/13.jpg", "statue_colmap/dense/0/images/DSC_5283.jpg"]
+    "photo",
+    [
+        "fox/images/0012.jpg",
+        "captures/kitchen/images/13.jpg",
+        "statue_colmap/dense/0/images/DSC_5283.jpg",
+    ],
 )
 def test_undoing_a_lens_keeps_the_detail_of_a_photo(photo, side):
     """Variance of the Laplacian, against that of the photo reduced alike and otherwise as it is."""
     image = Image.open(data(photo.split("/")[0]) / photo.partition("/")[2]).convert("RGB")
     width, height = image.size
-    camera = Camera("SIMPLE_RADIAL", (1.2 * max(width, height), width / 2, height / 2, -0.05), width, height)
+    camera = Camera(
+        "SIMPLE_RADIAL", (1.2 * max(width, height), width / 2, height / 2, -0.05), width, height
+    )
     view = assembly.geometry(camera, side)
     found = assembly.resampled(image, camera, view, assembly.positions(camera, view))
     size = [round(n * view.factor) for n in image.size]
-    plain = np.asarray(image if size == list(image.size) else image.resize(size, Image.Resampling.BOX))
+    plain = np.asarray(
+        image if size == list(image.size) else image.resize(size, Image.Resampling.BOX)
+    )
     cut = [max((a - b) // 2, 0) + 4 for a, b in zip(plain.shape[:2], found.shape[:2], strict=True)]
     inner = plain[cut[0] : -cut[0], cut[1] : -cut[1]]
-    kept, before = (laplace(pixels.mean(-1, dtype=float)).var() for pixels in (found[4:-4, 4:-4], inner))
+    kept, before = (
+        laplace(pixels.mean(-1, dtype=float)).var() for pixels in (found[4:-4, 4:-4], inner)
+    )
     assert 0.93 < kept / before < 1.3
 
 
 @pytest.mark.data
 @pytest.mark.parametrize("max_side", [160, 8192])
 def test_test_photos_are_held_as_they_were_taken_and_measured_so(tmp_path, max_side):
-    """The best picture there is of a scene, its undistorted photo, and that of a lens that is wrong by a fifth."""
+    """The best picture there is of a scene, its undistorted photo, and that of a lens that is wrong
+    by a fifth.
+    """
     photo = Image.open(data("captures") / "kitchen/images/13.jpg").convert("RGB").resize((400, 300))
-    folder = write_colmap(tmp_path / "source", "OPENCV 400 300 390 400 203.3 148 -0.2 0.05 0.002 -0.003")
+    folder = write_colmap(
+        tmp_path / "source", "OPENCV 400 300 390 400 203.3 148 -0.2 0.05 0.002 -0.003"
+    )
     for name in "abc":
         photo.save(folder / f"images/{name}.png")
     config = {"source": {"kind": "colmap", "path": str(folder)}, "ingest": {"max_side": max_side}}
@@ -323,17 +407,22 @@ def test_test_photos_are_held_as_they_were_taken_and_measured_so(tmp_path, max_s
     capture = Capture.read(tmp_path / "capture")
     tests = [name for name, is_test in zip(capture.names, capture.is_test, strict=True) if is_test]
     assert [lens[0] for lens in capture.lenses] == tests
-    np.testing.assert_array_equal(capture.taken[0], photo)  # at its own resolution, whatever is trained on
+    # at its own resolution, whatever is trained on
+    np.testing.assert_array_equal(capture.taken[0], photo)
     views = {}
     for name, K in zip(capture.names, capture.Ks, strict=True):
         views[name] = View(torch.tensor(K).float(), torch.eye(4), *capture.size)
-    pictures = SimpleNamespace(render=lambda view: (np.asarray(undistorted.resize((view.width, view.height))), None))
+    pictures = SimpleNamespace(
+        render=lambda view: (np.asarray(undistorted.resize((view.width, view.height))), None)
+    )
     undistorted = Image.fromarray(np.asarray(capture.images[0]))
     capture.taken = dict(enumerate(capture.taken))  # which gives one at a time alone
     right = figures_as_taken(capture, pictures, views)
     assert right["size"] == [400, 300] and right["psnr"] > (30 if max_side > 400 else 20)
     capture.lenses[0][2][4] *= 1.2
-    assert figures_as_taken(capture, pictures, views)["psnr"] < right["psnr"] - (3 if max_side > 400 else 1)
+    assert figures_as_taken(capture, pictures, views)["psnr"] < right["psnr"] - (
+        3 if max_side > 400 else 1
+    )
 
 
 def test_the_size_of_photos_as_taken_is_one_that_they_have():
@@ -344,7 +433,9 @@ def test_the_size_of_photos_as_taken_is_one_that_they_have():
         capture.lenses.append([name, "PINHOLE", [40.0, 40.0, width / 2, height / 2], width, height])
         K = torch.tensor([[20.0, 0, width / 4], [0, 20, height / 4], [0, 0, 1]])
         views[name] = View(K, torch.eye(4), width // 2, height // 2)
-    grey = SimpleNamespace(render=lambda view: (np.full((view.height, view.width, 3), 90, np.uint8), None))
+    grey = SimpleNamespace(
+        render=lambda view: (np.full((view.height, view.width, 3), 90, np.uint8), None)
+    )
     found = figures_as_taken(capture, grey, views)
     assert (found["size"], found["psnr"], found["ssim"]) == ([48, 32], 100, pytest.approx(1))
     assert figures_as_taken(capture, grey, {}) is None
@@ -360,7 +451,9 @@ def test_pixels_where_a_distortion_folds_back_do_not_count(tmp_path):
 
 
 def test_focal_lengths_follow_each_side_as_it_was_rounded(tmp_path):
-    fields = colmap.read(write_colmap(tmp_path, "SIMPLE_PINHOLE 101 37 50 50.5 18.5"), IngestSection(max_side=20))
+    fields = colmap.read(
+        write_colmap(tmp_path, "SIMPLE_PINHOLE 101 37 50 50.5 18.5"), IngestSection(max_side=20)
+    )
     assert fields["images"].shape == (3, 7, 20, 3)
     assert np.allclose(fields["Ks"][0], [[50 * 20 / 101, 0, 10], [0, 50 * 7 / 37, 3.5], [0, 0, 1]])
 
@@ -405,11 +498,16 @@ def test_exif_turns_a_photo_and_gives_its_focal_length(tmp_path):
     assert fields["images"].shape == (3, 80, 60, 3)
     assert fields["images"][0, :30].min() > 200 and fields["images"][0, 50:].max() < 50
     assert np.allclose(fields["Ks"][:, 0, 0], [28 / 36 * 80, 28 / 36 * 80, 96])
-    assert "1 of 2 photos have no focal length" in photos.shots(tmp_path, PoseSection(), None, 1)[1][-1]
+    assert (
+        "1 of 2 photos have no focal length"
+        in photos.shots(tmp_path, PoseSection(), None, 1)[1][-1]
+    )
 
 
 def test_transparent_pixels_are_empty_and_count(tmp_path):
-    """They are black, as a render of nothing is; half alpha is half of the colour; a photo of nothing says nothing."""
+    """They are black, as a render of nothing is; half alpha is half of the colour; a photo of
+    nothing says nothing.
+    """
     for k, alpha in enumerate((255, 100, 0)):
         pixels = np.full((6, 8, 4), 255, np.uint8)
         pixels[:, :4, 3] = alpha
@@ -418,7 +516,9 @@ def test_transparent_pixels_are_empty_and_count(tmp_path):
     fields = alone(tmp_path)
     assert fields["images"][:, 0, [0, 7], 0].tolist() == [[255, 255], [100, 255], [0, 0]]
     assert fields["loss_mask"].mean((1, 2)).tolist() == [1, 1, 0]
-    assert "2 of 3 photos have transparent pixels, which are empty space." in fields["source"]["notes"]
+    assert (
+        "2 of 3 photos have transparent pixels, which are empty space." in fields["source"]["notes"]
+    )
 
 
 def test_images_are_reduced_but_never_enlarged(tmp_path):
@@ -434,7 +534,10 @@ def test_depth_that_is_not_wanted_is_left_out_and_nothing_else(tmp_path):
     write_colmap(tmp_path / "source")
     made = []
     for depth in ("auto", "off"):
-        config = {"source": {"kind": "colmap", "path": str(tmp_path / "source")}, "ingest": {"depth": depth}}
+        config = {
+            "source": {"kind": "colmap", "path": str(tmp_path / "source")},
+            "ingest": {"depth": depth},
+        }
         assert run_stage("ingest", tmp_path / depth, config=config) == 0
         made.append(Capture.read(tmp_path / depth))
     assert made[0].depth is not None and made[1].depth is None

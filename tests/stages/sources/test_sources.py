@@ -10,11 +10,21 @@ from source_folders import SETTINGS, SMALL, change_frame, image, write_transform
 from chebsplat.cameras import unproject
 from chebsplat.errors import InputError
 from chebsplat.stages.settings import IngestSection
-from chebsplat.stages.sources import colmap, common, photos, replica, scannet, seven_scenes, transforms
+from chebsplat.stages.sources import (
+    colmap,
+    common,
+    photos,
+    replica,
+    scannet,
+    seven_scenes,
+    transforms,
+)
 
 
 def agreement(fields, a, b):
-    """(share of view a's pixels that view b sees at their depth, share of these whose labels agree)."""
+    """(share of view a's pixels that view b sees at their depth, share of these whose labels
+    agree).
+    """
     pixels = np.argwhere(np.isfinite(fields["depth"][a]))
     points = unproject(fields["depth"][a], fields["Ks"][a], fields["cam_from_world"][a], pixels)
     pose = fields["cam_from_world"][b]
@@ -39,7 +49,8 @@ def test_house_kitchen_poses_depth_and_labels_agree_between_views():
     shares = np.array([agreement(fields, a, b) for a in range(20) for b in range(20) if a != b])
     labels = shares[shares[:, 0] > 0.2, 1]
     assert len(labels) >= 180  # 197; a principal point 3 pixels off leaves 139
-    assert labels.min() > 0.97  # 0.977; what disagrees are object borders, at nearest pixels of a quarter of the size
+    # 0.977; what disagrees are object borders, at nearest pixels of a quarter of the size
+    assert labels.min() > 0.97
     assert "void" not in fields["class_names"]
     assert [int(name[-4:]) % 8 == 0 for name in fields["names"]] == fields["is_test"].tolist()
 
@@ -82,9 +93,13 @@ def test_natural_order_compares_numbers_and_keeps_spellings_apart():
 
 
 def test_frames_may_have_their_own_angles_of_view(tmp_path):
-    folder = change_frame(write_transforms(tmp_path), 1, camera_angle_x=np.pi / 2, fl_x=20.0, fl_y=5.0)
+    folder = change_frame(
+        write_transforms(tmp_path), 1, camera_angle_x=np.pi / 2, fl_x=20.0, fl_y=5.0
+    )
     assert np.allclose(transforms.read(folder, SETTINGS)["Ks"][:, 0, 0], [10, 20, 10])
-    folder = write_transforms(tmp_path, fl_x="absent", camera_angle_x=np.pi / 2, camera_angle_y=2 * np.arctan(1.5))
+    folder = write_transforms(
+        tmp_path, fl_x="absent", camera_angle_x=np.pi / 2, camera_angle_y=2 * np.arctan(1.5)
+    )
     assert np.allclose(transforms.read(folder, SETTINGS)["Ks"][:, [0, 1], [0, 1]], [4, 2])
 
 
@@ -117,7 +132,9 @@ def test_a_pose_that_is_not_finite_is_dropped_with_a_note(tmp_path, value):
 
 def test_no_name_of_a_view_tells_where_the_folder_lies(tmp_path):
     folder = write_transforms(tmp_path)
-    for k, listed in enumerate(("./images/frame_9.png", "images\\frame_10.png", str(folder / "images/frame_11.png"))):
+    for k, listed in enumerate(
+        ("./images/frame_9.png", "images\\frame_10.png", str(folder / "images/frame_11.png"))
+    ):
         change_frame(folder, k, file_path=listed)
     fields = transforms.read(folder, SETTINGS)
     assert fields["names"] == ["frame_9", "frame_10", "frame_11"]
@@ -136,7 +153,10 @@ def test_a_folder_without_photos_is_no_source(tmp_path):
 
 
 def test_probes_of_a_thousand_frames_open_no_picture(tmp_path, monkeypatch):
-    folders = {n: tmp_path / n for n in ("slam", "nerf", "colmap", "transforms", "photos", "scannet", "seven")}
+    folders = {
+        n: tmp_path / n
+        for n in ("slam", "nerf", "colmap", "transforms", "photos", "scannet", "seven")
+    }
     pixels = image(tmp_path / "x.png").read_bytes()
     (tmp_path / "x.png").unlink()
     for part in ("slam/results/frame{:06d}.jpg", "slam/results/depth{:06d}.png", "nerf/Sequence_1/rgb/rgb_{}.png",
@@ -148,8 +168,13 @@ def test_probes_of_a_thousand_frames_open_no_picture(tmp_path, monkeypatch):
         (tmp_path / part).parent.mkdir(parents=True, exist_ok=True)
         for k in range(1000):
             (tmp_path / part.format(k)).write_bytes(pixels)
-    frames = [{"file_path": f"images/{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(1000)]
-    (folders["transforms"] / "transforms.json").write_text(json.dumps({"fl_x": 1.0, "frames": frames}))
+    frames = [
+        {"file_path": f"images/{k}.png", "transform_matrix": np.eye(4).tolist()}
+        for k in range(1000)
+    ]
+    (folders["transforms"] / "transforms.json").write_text(
+        json.dumps({"fl_x": 1.0, "frames": frames})
+    )
     modules = {"slam": replica, "nerf": replica, "colmap": colmap, "transforms": transforms, "photos": photos,
                "scannet": scannet, "seven": seven_scenes}  # fmt: skip
     monkeypatch.setattr("PIL.Image.open", lambda *_, **__: pytest.fail("a probe opened a picture"))

@@ -18,7 +18,9 @@ def test_raw_photos_and_videos_beside_photos_are_counted_in_notes_and_plan(tmp_p
     source = SourceSection(kind="photos", path=str(tmp_path))
     model = model_of([str(k) for k in range(3)], [(8, 6)] * 3, [None] * 3)
     note = ingest.read("scene", source, IngestSection(min_views=2), model)["source"]["notes"][-1]
-    assert note.startswith("2 .cr2, 1 .mp4 not read; convert to JPEG, for example with `darktable-cli a.cr2 a.jpg`")
+    assert note.startswith(
+        "2 .cr2, 1 .mp4 not read; convert to JPEG, for example with `darktable-cli a.cr2 a.jpg`"
+    )
     assert "a video is read by itself" in note
     assert f"({note[:-1]})" in source_sentence("scene", source, source)
     assert common.unread(tmp_path / "absent") == ""

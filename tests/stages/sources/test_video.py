@@ -25,7 +25,11 @@ RATE, SPEED = 30, 2  # frames/s, pixels a frame
 def panorama():
     rng = np.random.default_rng(1)
     rough = zoom(rng.uniform(0, 255, (16, 80)), 8, order=1)
-    return gaussian_filter(rough + rng.uniform(-60, 60, rough.shape), 0.7).clip(0, 255).astype(np.uint8)
+    return (
+        gaussian_filter(rough + rng.uniform(-60, 60, rough.shape), 0.7)
+        .clip(0, 255)
+        .astype(np.uint8)
+    )
 
 
 def film(path, n=120, size=(192, 128), turn=0, blur=()):
@@ -34,7 +38,12 @@ def film(path, n=120, size=(192, 128), turn=0, blur=()):
     wide, (width, height) = panorama(), size
     with av.open(str(path), "w") as out:
         stream = out.add_stream("mpeg4", rate=RATE)
-        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = width, height, "yuv420p", 8_000_000
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = (
+            width,
+            height,
+            "yuv420p",
+            8_000_000,
+        )
         if turn:
             stream.set_display_rotation(turn)
         for k in range(n):
@@ -81,7 +90,8 @@ def test_frames_are_apart_sharp_in_order_and_the_same_again(tmp_path, capfd):
     assert "frames 120/120" in capfd.readouterr().err and "frames are used" in notes[0]
     at = np.array([float(shot.name) for shot in shots]) * RATE
     assert not {round(k) for k in at} & blur
-    assert (np.diff(at) * SPEED / 192 < 2 * STEP).all() and len(at) > 120 * SPEED / 192 / STEP - 3  # pixels are whole
+    # pixels are whole
+    assert (np.diff(at) * SPEED / 192 < 2 * STEP).all() and len(at) > 120 * SPEED / 192 / STEP - 3
     names = [shot.name for shot in shots]
     assert names == sorted(names)
     finer = video.shots(file, PoseSection(), None, 2)[0]
@@ -98,12 +108,16 @@ def test_frames_are_apart_sharp_in_order_and_the_same_again(tmp_path, capfd):
 def filmed(file, settings):
     """The fields of a video of which all frames are placed."""
     shots, _ = video.shots(file, PoseSection(), None, 1)
-    model = model_of([shot.name for shot in shots], [shot.size for shot in shots], [None] * len(shots))
+    model = model_of(
+        [shot.name for shot in shots], [shot.size for shot in shots], [None] * len(shots)
+    )
     model.frames = [shot.frame for shot in shots]
     return video.read(file, settings, model)
 
 
-@pytest.mark.parametrize(("turn", "row", "column"), [(-90, 10, -10), (90, -10, 10), (180, -10, -10)])
+@pytest.mark.parametrize(
+    ("turn", "row", "column"), [(-90, 10, -10), (90, -10, 10), (180, -10, -10)]
+)
 def test_a_video_is_turned_as_its_phone_was_held(tmp_path, turn, row, column):
     file = film(tmp_path / "a.mov", n=60, turn=turn)
     images = filmed(file, IngestSection())["images"]
@@ -117,7 +131,9 @@ def test_a_video_that_hardly_moves_says_so(tmp_path):
         video.shots(film(tmp_path / "a.mp4", n=5), PoseSection(), None, 1)
 
 
-@pytest.mark.parametrize("content", [b"", b"text", bytes(64), b"ffconcat version 1.0\nfile b.mp4\n", None])
+@pytest.mark.parametrize(
+    "content", [b"", b"text", bytes(64), b"ffconcat version 1.0\nfile b.mp4\n", None]
+)
 def test_what_is_no_video_is_named_and_no_playlist_is_followed(tmp_path, content):
     whole = film(tmp_path / "b.mp4", n=5).read_bytes()
     (tmp_path / "a.mp4").write_bytes(whole[: len(whole) // 2] if content is None else content)
@@ -129,7 +145,9 @@ def test_without_the_extra_a_video_is_one_line_that_installs_it(tmp_path, monkey
     monkeypatch.setitem(sys.modules, "av", None)
     (tmp_path / "a.mp4").write_bytes(b"\0")
     for read in (videos.describe, lambda path: media_packages([path])):
-        with pytest.raises(InputError, match=r"a\.mp4 is a video.*pip install -e '\.\[video\]'") as raised:
+        with pytest.raises(
+            InputError, match=r"a\.mp4 is a video.*pip install -e '\.\[video\]'"
+        ) as raised:
             read(tmp_path / "a.mp4")
         assert raised.value.exit_code == 3 and "\n" not in str(raised.value)
 
@@ -142,7 +160,10 @@ def test_a_file_names_a_scene_and_is_its_raw_input(tmp_path, monkeypatch):
         name, values = scenes.scene_values(given)
         assert (name, values["source"]) == ("my-walk", {"kind": "video", "path": str(file)})
     for path in (file, tmp_path):
-        assert raw_files("pose", {"source": {"kind": "video", "path": str(path)}}) == (tmp_path, [file])
+        assert raw_files("pose", {"source": {"kind": "video", "path": str(path)}}) == (
+            tmp_path,
+            [file],
+        )
     (tmp_path / "b.mp4").write_bytes(b"\0")
     with pytest.raises(InputError, match="2 videos"):
         video.files(tmp_path)

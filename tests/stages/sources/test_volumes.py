@@ -31,7 +31,11 @@ def written(folder, **changed):
 
 def test_a_generated_room_s_floor_is_found_by_its_depth(tmp_path):
     config = TOY | {"ingest": {"volumes": str(written(tmp_path))}}
-    assert run_stage("ingest", tmp_path / "exact", {}, TOY) == run_stage("ingest", tmp_path / "out", {}, config) == 0
+    assert (
+        run_stage("ingest", tmp_path / "exact", {}, TOY)
+        == run_stage("ingest", tmp_path / "out", {}, config)
+        == 0
+    )
     exact, found = (Capture.read(tmp_path / name) for name in ("exact", "out"))
     assert found.class_names == ["floor", "high"]
     truth, labels = np.asarray(exact.labels[:]), np.asarray(found.labels[:])
@@ -49,7 +53,10 @@ VOLUME = WHOLE["volumes"][0]
 @pytest.mark.parametrize(
     ("changed", "word"),
     [
-        ({"frame": np.eye(3).tolist()}, "its frame and margin"), ({"margin": "2 cm"}, "its frame and margin"),
+        ({"frame": np.eye(3).tolist()}, "its frame and margin"), ({"margin": "2 cm"}, "its frame and "
+                                                                                      ""
+                                                                                      ""
+                                                                                      "margin"),
         ({"volumes": [VOLUME, {"name": "x", "height": [0, 1]}]}, r"volume 1: 'polygon'"),
         ({"volumes": [VOLUME | {"height": [1, 0]}]}, "volume 0: holds no volume"),
         ({"volumes": [VOLUME | {"height": 1}]}, "volume 0"),
@@ -72,7 +79,11 @@ def test_what_a_file_of_volumes_says_makes_labels_anew_and_where_it_lies_does_no
         return Planner().plan("toy", f"ingest.volumes={path}").targets["ingest"].name
 
     (tmp_path / "other").mkdir()
-    assert key(written(tmp_path)) == key(written(tmp_path / "other")) != key(written(tmp_path, margin=0.03))
+    assert (
+        key(written(tmp_path))
+        == key(written(tmp_path / "other"))
+        != key(written(tmp_path, margin=0.03))
+    )
 
 
 @pytest.mark.data

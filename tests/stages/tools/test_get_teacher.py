@@ -1,4 +1,6 @@
-"""Teachers from a stand-in of the hub: whole, interrupted, damaged, out of reach. The hub itself is never asked."""
+"""Teachers from a stand-in of the hub: whole, interrupted, damaged, out of reach. The hub itself is
+never asked.
+"""
 
 import hashlib
 import json
@@ -20,15 +22,28 @@ from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.stages.tools.get_teacher import check, get_teacher, parsed, preparation, token_for
 
-REPOSITORY, COMMIT, CLASSES = "some/Segmenter-B0", "c" * 40, ["wall", "floor", "sofa: a seat", "wall"]
+REPOSITORY, COMMIT, CLASSES = (
+    "some/Segmenter-B0",
+    "c" * 40,
+    ["wall", "floor", "sofa: a seat", "wall"],
+)
 NAME, SHORT = f"hf:{REPOSITORY}", "segmenter-b0"
-PREPARATION = {"size": {"height": 64, "width": 64}, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.2, 0.2, 0.2]}
+PREPARATION = {
+    "size": {"height": 64, "width": 64},
+    "image_mean": [0.485, 0.456, 0.406],
+    "image_std": [0.2, 0.2, 0.2],
+}
 
 
 def segmenter(path):
-    """Bytes of a segmenter whose logits are [1, C, h / 4, w / 4], and that is large enough to break off."""
+    """Bytes of a segmenter whose logits are [1, C, h / 4, w / 4], and that is large enough to break
+    off.
+    """
     rng = np.random.default_rng(0)
-    constants = {"kernel": rng.normal(size=(len(CLASSES), 3, 4, 4)), "padding": rng.normal(size=100_000)}
+    constants = {
+        "kernel": rng.normal(size=(len(CLASSES), 3, 4, 4)),
+        "padding": rng.normal(size=100_000),
+    }
     constants = {name: values.astype(np.float32) for name, values in constants.items()}
     node = helper.make_node("Conv", ["image", "kernel"], ["logits"], strides=[4, 4])
     shape = ("batch_size", "num_channels", "height", "width")
@@ -37,7 +52,8 @@ def segmenter(path):
 
 
 class Hub(ThreadingHTTPServer):
-    """Of one repository, whose checksums may be false (`sums`) and whose answers are `cut`; `asked`: its requests.
+    """Of one repository, whose checksums may be false (`sums`) and whose answers are `cut`;
+    `asked`: its requests.
 
     store: the origin that it sends on to for large files; tokens: those that came with requests.
     """
@@ -57,7 +73,11 @@ class Hub(ThreadingHTTPServer):
 
     def checksum(self, name):
         data = self.files[name]
-        true = hashlib.sha256(data) if name.endswith(".onnx") else hashlib.sha1(b"blob %d\0" % len(data) + data)
+        true = (
+            hashlib.sha256(data)
+            if name.endswith(".onnx")
+            else hashlib.sha1(b"blob %d\0" % len(data) + data)
+        )
         return self.sums.get(name, true.hexdigest())
 
 
@@ -96,7 +116,9 @@ class Answer(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def constants():
-    return pytest.importorskip("huggingface_hub.constants", reason="the extra `hub` is not installed")
+    return pytest.importorskip(
+        "huggingface_hub.constants", reason="the extra `hub` is not installed"
+    )
 
 
 @pytest.fixture
@@ -129,7 +151,9 @@ def usual(v, m, s):
     return (v / 255 - m) / s
 
 
-FED = {  # of preprocessor_config.json: other keys, what the hub's processor makes of colours 0 to 255, keys of the TOML
+# of preprocessor_config.json: other keys, what the hub's processor makes of colours 0 to 255, keys
+# of the TOML
+FED = {
     "as usual": (NORM, usual, {"mean": [0.485, 0.456, 0.406]}),
     "said in full": (
         NORM | {"do_rescale": True, "rescale_factor": 0.00392156862745098, "do_normalize": True, "do_pad": True},
@@ -189,12 +213,22 @@ def test_a_model_is_fed_what_the_hub_s_own_processor_would_feed_it(tmp_path, cas
         (NORM | {"resample": 9}, "resample of 9"),
         (NORM | {"size": {"width": 64}}, "no size of whole numbers"),
         (NORM | {"do_center_crop": True}, "no crop_size"),
-        ({"image_mean": [123.675, 116.28, 103.53], "image_std": [58.395, 57.12, 57.375]}, "of colours in 0 to 255"),
-        ({"image_mean": [0.5, 0.5], "image_std": [0.5, 0.5]}, "no image_mean or image_std of three numbers"),
+        (
+            {"image_mean": [123.675, 116.28, 103.53], "image_std": [58.395, 57.12, 57.375]},
+            "of colours in 0 to 255",
+        ),
+        (
+            {"image_mean": [0.5, 0.5], "image_std": [0.5, 0.5]},
+            "no image_mean or image_std of three numbers",
+        ),
     ],
 )
 def test_what_no_key_of_a_teacher_stands_for_is_refused_by_name(tmp_path, values, word):
-    with pytest.raises(InputError, match=rf"{REPOSITORY}: preprocessor_config.json .*{word}.*; export"):
+    with pytest.raises(
+        InputError,
+        match=rf"{REPOSITORY}: preprocessor_config.json .*{word}.*; "
+        r"export",
+    ):
         written(tmp_path, values)
 
 
@@ -206,7 +240,9 @@ def test_weights_beside_a_graph_come_along_and_count_in_its_checksum(tmp_path, m
     moved_out(held / "onnx/model.onnx", "model.onnx_data")
     (held / "config.json").write_text(json.dumps({"id2label": dict(enumerate(CLASSES))}))
     (held / "preprocessor_config.json").write_text(json.dumps(PREPARATION))
-    monkeypatch.setattr("chebsplat.stages.tools.get_teacher.fetched", lambda repository, file, revision: held / file)
+    monkeypatch.setattr(
+        "chebsplat.stages.tools.get_teacher.fetched", lambda repository, file, revision: held / file
+    )
     model, _ = get_teacher(NAME, tmp_path / "out")
     assert (tmp_path / "out/model.onnx_data").is_file()
     check(model)
@@ -226,8 +262,16 @@ def test_a_repository_becomes_a_teacher_of_three_files(hub, tmp_path):
     teacher = read_teacher(model)
     assert (teacher.output, teacher.size, teacher.base) == ("logits", (64, 64), 85)
     assert teacher.mean == (0.485, 0.456, 0.406)
-    assert teacher.sha256 == hub.checksum("onnx/model.onnx") and teacher.origin == f"{NAME}@main/onnx/model.onnx"
-    assert (tmp_path / SHORT / f"{SHORT}.txt").read_text().splitlines() == ["wall", "floor", "sofa a seat", "wall (3)"]
+    assert (
+        teacher.sha256 == hub.checksum("onnx/model.onnx")
+        and teacher.origin == f"{NAME}@main/onnx/model.onnx"
+    )
+    assert (tmp_path / SHORT / f"{SHORT}.txt").read_text().splitlines() == [
+        "wall",
+        "floor",
+        "sofa a seat",
+        "wall (3)",
+    ]
     assert "logits, 4 channels" in dict(findings)["output"]
     hub.asked.clear()
     assert get_teacher(NAME)[0] == model  # there already
@@ -236,7 +280,11 @@ def test_a_repository_becomes_a_teacher_of_three_files(hub, tmp_path):
 
 def test_a_download_that_broke_off_leaves_nothing_half(hub, tmp_path):
     hub.cut = 200_000
-    with pytest.raises(InputError, match=r"onnx/model.onnx broke off \(.*\); run the same command again"):
+    with pytest.raises(
+        InputError,
+        match=r"onnx/model.onnx broke off \(.*\); run the same command "
+        r"again",
+    ):
         get_teacher(NAME)
     assert not list(tmp_path.glob("*segmenter*")) and not list(tmp_path.rglob("*.incomplete"))
     hub.cut, _ = None, hub.asked.clear()
@@ -249,7 +297,9 @@ def test_a_download_that_broke_off_leaves_nothing_half(hub, tmp_path):
 @pytest.mark.parametrize("name", ["onnx/model.onnx", "config.json"])
 def test_a_wrong_checksum_is_refused_and_its_file_named(hub, tmp_path, name):
     hub.sums[name] = "0" * len(hub.checksum(name))
-    with pytest.raises(InputError, match=r"has the checksum \w+, 0+ is right: damaged .*; remove it") as error:
+    with pytest.raises(
+        InputError, match=r"has the checksum \w+, 0+ is right: damaged .*; remove it"
+    ) as error:
         get_teacher(NAME)
     assert not (tmp_path / SHORT).exists()
     del hub.sums[name]
@@ -282,7 +332,10 @@ def test_an_encoder_that_was_replaced_later_is_refused(hub):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda files: files.pop("onnx/model.onnx"), "has no onnx/model.onnx at main; name another ONNX file"),
+        (
+            lambda files: files.pop("onnx/model.onnx"),
+            "has no onnx/model.onnx at main; name another ONNX file",
+        ),
         (lambda files: files.update({"config.json": b"{}"}), "names no classes"),
         (lambda files: files.update({"config.json": b"[]"}), "is no JSON object"),
         (lambda files: files.update({"preprocessor_config.json": b"{}"}), "image_mean"),
@@ -290,7 +343,9 @@ def test_an_encoder_that_was_replaced_later_is_refused(hub):
         (lambda files: files.update({"config.json": b'{"id2label": {"0": "wall"}}'}), "4 channels"),
     ],
 )
-def test_a_repository_that_holds_no_teacher_is_one_line_and_leaves_no_folder(hub, tmp_path, change, message):
+def test_a_repository_that_holds_no_teacher_is_one_line_and_leaves_no_folder(
+    hub, tmp_path, change, message
+):
     change(hub.files)
     with pytest.raises(InputError, match=message) as error:
         get_teacher(NAME)
@@ -320,7 +375,9 @@ def test_a_repository_that_is_not_there_and_a_folder_of_something_else(hub, tmp_
         ("https://hub.example.org", "hf_mine", True),
     ],
 )
-def test_the_token_of_a_login_goes_to_the_hub_s_own_origin_alone(monkeypatch, endpoint, named, sent):
+def test_the_token_of_a_login_goes_to_the_hub_s_own_origin_alone(
+    monkeypatch, endpoint, named, sent
+):
     monkeypatch.setenv("HF_TOKEN", named)
     assert token_for(endpoint) is (None if sent else False)
 
@@ -340,7 +397,11 @@ def test_no_token_follows_to_another_origin(hub, tmp_path, monkeypatch, named):
 
 
 def test_names():
-    assert parsed("segformer-b0-ade") == ("Xenova/segformer-b0-finetuned-ade-512-512", "main", "segformer-b0-ade")
+    assert parsed("segformer-b0-ade") == (
+        "Xenova/segformer-b0-finetuned-ade-512-512",
+        "main",
+        "segformer-b0-ade",
+    )
     assert parsed("hf:some/Segmenter-B0@v1") == ("some/Segmenter-B0", "v1", "segmenter-b0")
     for wrong in ("segformer", "hf:one", "hf:a/b/c", "hf:../..//x"):
         with pytest.raises(ConfigError, match="segformer-b0-ade"):
@@ -348,7 +409,11 @@ def test_names():
 
 
 def command(tmp_path, *arguments, **environment):
-    environment = os.environ | {"HF_HOME": str(tmp_path / "hf"), "HF_HUB_DISABLE_PROGRESS_BARS": "1"} | environment
+    environment = (
+        os.environ
+        | {"HF_HOME": str(tmp_path / "hf"), "HF_HUB_DISABLE_PROGRESS_BARS": "1"}
+        | environment
+    )
     call = [sys.executable, "-m", "chebsplat.pipelines.cli", "get-teacher", *arguments]
     return subprocess.run(call, cwd=tmp_path, env=environment, capture_output=True, text=True)
 
@@ -365,7 +430,11 @@ def test_without_a_network_the_cache_serves_and_what_it_has_not_is_one_line_with
     get_teacher(NAME, tmp_path / "a")
     ask(constants, monkeypatch, "http://127.0.0.1:9")
     assert get_teacher(NAME, tmp_path / "b")[0].is_file()
-    with pytest.raises(InputError, match=r"cache and http://127.0.0.1:9 is not reached; connect, or set HF_ENDPOINT"):
+    with pytest.raises(
+        InputError,
+        match=r"cache and http://127.0.0.1:9 is not reached; connect, "
+        r"or set HF_ENDPOINT",
+    ):
         get_teacher("segformer-b0-ade")
     done = command(tmp_path, "segformer-b0-ade", HF_HUB_OFFLINE="1")
     assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (3, "", 1)

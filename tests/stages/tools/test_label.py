@@ -1,4 +1,6 @@
-"""`chebsplat label` names the Gaussians of a splat by shape alone, and says what it cannot work with."""
+"""`chebsplat label` names the Gaussians of a splat by shape alone, and says what it cannot work
+with.
+"""
 
 import numpy as np
 import pytest
@@ -25,7 +27,10 @@ def box(tmp_path):
         quats.append(np.tile(Rotation.from_matrix(axes).as_quat(scalar_first=True), (500, 1)))
     n = 500 * len(sides)
     raw = {"means": np.concatenate(means), "quats": np.concatenate(quats)}
-    raw |= {"log_scales": np.tile(np.log([0.1, 0.1, 0.002]), (n, 1)), "logit_opacities": np.full(n, 3.0)}
+    raw |= {
+        "log_scales": np.tile(np.log([0.1, 0.1, 0.002]), (n, 1)),
+        "logit_opacities": np.full(n, 3.0),
+    }
     raw |= {"sh0": np.zeros((n, 1, 3)), "shN": np.zeros((n, 15, 3))}
     path = tmp_path / "box.ply"
     write_ply(path, {name: values.astype(np.float32) for name, values in raw.items()}, 0)

@@ -1,4 +1,6 @@
-"""`chebsplat page`: a scene in one file. Slow tests open it in a real browser, from file://, and drive it."""
+"""`chebsplat page`: a scene in one file. Slow tests open it in a real browser, from file://, and
+drive it.
+"""
 
 import base64
 import gzip
@@ -62,13 +64,17 @@ def held_in(page):
     """(about, arrays) of a page."""
     text = page.read_text()
     about = json.loads(re.search(r'id="about">(.*?)</script>', text, re.DOTALL)[1])
-    blob = gzip.decompress(base64.b64decode(re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1]))
+    blob = gzip.decompress(
+        base64.b64decode(re.search(r'id="data">(.*?)</script>', text, re.DOTALL)[1])
+    )
     return about, from_bytes(blob, about["places"])
 
 
 def test_a_gaussian_takes_at_most_20_bytes_at_degree_0():
     parameters, _, _ = room(500)
-    arrays = pack({name: values for name, values in parameters.items() if name != "features"}).arrays
+    arrays = pack(
+        {name: values for name, values in parameters.items() if name != "features"}
+    ).arrays
     assert {name: values.nbytes / 500 for name, values in arrays.items()} == BYTES
     assert sum(BYTES.values()) <= 20
 
@@ -81,15 +87,23 @@ def test_what_is_unpacked_is_what_was_packed_to_its_steps(sh_degree):
     found, others = unpack(packed), np.arange(2000) != 7
     assert np.abs(found["means"] - parameters["means"])[others].max() < 3e-4  # half of 4000 / 2^24
     step = np.array(packed.ranges["log_scales"]["step"])
-    assert (np.abs(found["log_scales"] - parameters["log_scales"])[others].max(0) <= 0.51 * step).all()
+    assert (
+        np.abs(found["log_scales"] - parameters["log_scales"])[others].max(0) <= 0.51 * step
+    ).all()
     unit = parameters["quats"] / np.linalg.norm(parameters["quats"], axis=1, keepdims=True)
     assert np.abs((unit * found["quats"]).sum(1)).min() > 1 - 2e-6  # 10 bits: angles to 0.2 degrees
     opacities = [1 / (1 + np.exp(-p["logit_opacities"])) for p in (parameters, found)]
     assert np.abs(opacities[0] - opacities[1]).max() <= 0.51 / 255
-    assert np.abs(found["sh0"] - parameters["sh0"]).max() * C0 <= 0.51 * max(packed.ranges["colors"]["step"])
-    assert np.abs(found["features"] - parameters["features"]).max() <= 0.51 * max(packed.ranges["features"]["step"])
+    assert np.abs(found["sh0"] - parameters["sh0"]).max() * C0 <= 0.51 * max(
+        packed.ranges["colors"]["step"]
+    )
+    assert np.abs(found["features"] - parameters["features"]).max() <= 0.51 * max(
+        packed.ranges["features"]["step"]
+    )
     if sh_degree:
-        assert np.abs(found["shN"] - parameters["shN"]).max() <= 0.51 * max(packed.ranges["sh1"]["step"])
+        assert np.abs(found["shN"] - parameters["shN"]).max() <= 0.51 * max(
+            packed.ranges["sh1"]["step"]
+        )
     else:
         assert not found["shN"].any()
 
@@ -131,7 +145,10 @@ def test_a_packed_scene_looks_and_means_the_same(scene):
 
 def test_a_page_names_nothing_outside_itself(page):
     text = re.sub(r'id="data">.*?</script>', "", page.read_text(), flags=re.DOTALL)
-    outside = r"https?:|//[a-z]+\.|\bimport\b|\bfetch\(|XMLHttp|<link [^>]*href=\"(?!data:)|src=|url\("
+    outside = (
+        r"https?:|//[a-z]+\.|\bimport\b|\bfetch\(|XMLHttp|<link "
+        r"[^>]*href=\"(?!data:)|src=|url\("
+    )
     assert not re.search(outside, text)
     assert page.stat().st_size < 5_000_000
 
@@ -168,7 +185,9 @@ def test_a_calibrated_page_holds_what_asking_takes(calibrated):
 
 def test_phrases_of_ones_own_are_taken_instead_of_the_calibration(scene, calibrated, tmp_path):
     out = tmp_path / "against.html"
-    write_page(calibrated[0], "against", calibrated[1].source / "teacher", out, phrases=["things", "chair"])
+    write_page(
+        calibrated[0], "against", calibrated[1].source / "teacher", out, phrases=["things", "chair"]
+    )
     about, arrays = held_in(out)
     assert "calibration" not in about and "rivals" not in arrays
     assert about["against"] == ["things", "chair"]
@@ -205,10 +224,17 @@ def test_names_are_text_of_a_page_and_never_markup(scene, tmp_path):
         with driven(tmp_path) as browser:
             browser.open(tmp_path / "page.html", 390, 844)
             browser.run("scene.ready")
-            browser.run("get('panel').open = true; scene.show('labels'); scene.ask(about.labels[0].name)")
-            shown = browser.run("Array.from(get('legend').querySelectorAll('span'), part => part.textContent)")
+            browser.run(
+                "get('panel').open = true; scene.show('labels'); scene.ask(about.labels[0].name)"
+            )
+            shown = browser.run(
+                "Array.from(get('legend').querySelectorAll('span'), part => part.textContent)"
+            )
             assert sorted(shown) == sorted(NAMES)
-            assert browser.run("document.querySelectorAll('#panel svg, #panel img, #panel b').length") == 0
+            assert (
+                browser.run("document.querySelectorAll('#panel svg, #panel img, #panel b').length")
+                == 0
+            )
             assert browser.run("document.documentElement.scrollWidth") <= 390
             assert browser.complaints == []
 
@@ -240,8 +266,12 @@ def test_viewing_writes_the_page_anew_beside_the_scene_and_opens_it(scene, tmp_p
 
 
 def in_node(script, given):
-    """What an expression gives for `given`, awaited, with the functions of the page's Gaussians and cameras."""
-    source = "".join((ROOT / f"stages/pages/scene/{name}.js").read_text() for name in ("splats", "cameras"))
+    """What an expression gives for `given`, awaited, with the functions of the page's Gaussians and
+    cameras.
+    """
+    source = "".join(
+        (ROOT / f"stages/pages/scene/{name}.js").read_text() for name in ("splats", "cameras")
+    )
     program = f"{source}\nconst given = {json.dumps(given)};\n"
     program += f"(async () => console.log(JSON.stringify(await ({script}))))()"
     done = subprocess.run(["node", "-"], input=program, capture_output=True, text=True)
@@ -282,7 +312,13 @@ def test_a_link_holds_the_camera_and_one_that_does_not_gives_none():
     for name, value in at.items():
         np.testing.assert_allclose(found[name], value, atol=1e-5)
     good = in_node("link_of(given[0], given[1])", [at, about])
-    bad = [good.replace("=1,", "=2,"), good + ",1", good.replace("0.25", "-1"), "#camera=", good + "x"]
+    bad = [
+        good.replace("=1,", "=2,"),
+        good + ",1",
+        good.replace("0.25", "-1"),
+        "#camera=",
+        good + "x",
+    ]
     assert in_node("given[0].map(hash => camera_of(hash, given[1]))", [bad, about]) == [None] * 5
 
 
@@ -303,7 +339,9 @@ PLACED = """(async () => {
 
 
 def surface_of(view, depth, pixels):
-    """Points [M, 3] of the scene that a camera sees in these pixels, whose centres are x + 0.5, y + 0.5."""
+    """Points [M, 3] of the scene that a camera sees in these pixels, whose centres are x + 0.5, y +
+    0.5.
+    """
     rays = np.array([[x + 0.5, y + 0.5, 1] for x, y in pixels]) @ np.linalg.inv(view.K).T
     seen = rays * np.array([depth[y, x] for x, y in pixels])[:, None]
     return (seen - view.cam_from_world[:3, 3]) @ view.cam_from_world[:3, :3]
@@ -315,11 +353,17 @@ def test_labelled_points_lie_on_the_rendered_surface_and_teaching_reads_them(sce
     depth, covered = SceneRenderer(scene[1].parameters).render_depth(camera(scene[1], 1))
     pixels = [(x, y) for x, y in rng.integers(0, SIZE, (200, 2)).tolist() if covered[y, x] > 0.7]
     data = re.search(r'id="data">(.*?)</script>', page.read_text(), re.DOTALL)[1]
-    given = {"about": about, "data": data, "view": 1, "pixels": [(x + 0.5, y + 0.5) for x, y in pixels]}
+    given = {
+        "about": about,
+        "data": data,
+        "view": 1,
+        "pixels": [(x + 0.5, y + 0.5) for x, y in pixels],
+    }
     (tmp_path / "points.csv").write_text(in_node(PLACED, given))
     where, said = read_labels(tmp_path / "points.csv")
     away = np.linalg.norm(where - surface_of(load(scene[0]).cameras[1], depth, pixels), axis=1)
-    assert np.median(away) < 0.002 and away.max() < 0.05  # of a room of 5 m; the mean depth: 0.019, 0.6
+    # of a room of 5 m; the mean depth: 0.019, 0.6
+    assert np.median(away) < 0.002 and away.max() < 0.05
     assert said == [("chair", 'a "red" sofa, old')[k % 2] for k in range(len(pixels))]
 
 
@@ -355,7 +399,9 @@ def test_of_an_answer_in_several_places_the_densest_is_shown():
     assert 0.1 < found["radius"] < 0.6
 
 
-in_a_browser = pytest.mark.skipif(BROWSER is None, reason="neither chromium nor google-chrome is installed")
+in_a_browser = pytest.mark.skipif(
+    BROWSER is None, reason="neither chromium nor google-chrome is installed"
+)
 
 
 def decibels(image, truth):
@@ -364,7 +410,8 @@ def decibels(image, truth):
 
 def picture(browser, view, size=SIZE):
     """What the page draws of a view, u8 [H, W, 3]; size: of the capture, width and height."""
-    text = browser.run(f"(() => {{ let s = ''; for (const b of scene.picture({view})) s += String.fromCharCode(b); "
+    text = browser.run(f"(() => {{ let s = ''; for (const b of scene.picture({view})) s += "
+                       "String.fromCharCode(b); "
                        "return btoa(s); })()")  # fmt: skip
     return np.frombuffer(base64.b64decode(text), np.uint8).reshape(size[1], size[0], 4)[..., :3]
 
@@ -379,16 +426,20 @@ def test_in_a_browser_a_page_shows_names_and_answers_as_we_do(scene, page, tmp_p
         browser.run("scene.ready")
         for view in range(3):
             assert decibels(picture(browser, view), flat.render(camera(held, view))[0]) > 40
-        # hover, at three times the capture's pixels, against the label image that evaluate would make
+        # hover, at three times the capture's pixels, against the label image that evaluate would
+        # make
         browser.run("get('panel').open = false; get('panel').style.display = 'none'; scene.look(1)")
         _, features = SceneRenderer(held.parameters).render(camera(held, 1), with_features=True)
         truth, shares = decode(features, held.label_embeddings)
         covered = SceneRenderer(held.parameters).render_depth(camera(held, 1))[1] >= 0.5
-        places = np.stack([rng.integers(0, SIZE[0], 100), rng.integers(0, SIZE[1], 100)], 1).tolist()
+        places = np.stack(
+            [rng.integers(0, SIZE[0], 100), rng.integers(0, SIZE[1], 100)], 1
+        ).tolist()
         right, off = 0, []
         for x, y in places:
             browser.mouse("Moved", 3 * x + 1.5, 3 * y + 1.5)
-            said = browser.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => "
+            said = browser.run("new Promise(done => requestAnimationFrame(() => "
+                               "requestAnimationFrame(() => "
                                "done(tip.hidden ? '' : tip.textContent))))")  # fmt: skip
             name, share, _ = [*said.split(), "", "", ""][:3]
             right += name == (LABELS[truth[y, x]] if covered[y, x] else "")
@@ -404,7 +455,10 @@ def test_in_a_browser_a_page_shows_names_and_answers_as_we_do(scene, page, tmp_p
         warm = picture(browser, 1).astype(int)
         assert np.ptp(warm, axis=-1)[np.isin(truth, [3, 4]) & (shares > 0.5)].mean() > 60
         assert np.ptp(warm, axis=-1)[truth == 1].mean() < 40
-        assert (answer["presence"], "not calibrated" in browser.run("get('answer').textContent")) == (None, True)
+        assert (
+            answer["presence"],
+            "not calibrated" in browser.run("get('answer').textContent"),
+        ) == (None, True)
         assert browser.run("scene.ask('zebra')") is None
         # a click brings out a label, the legend hides one
         browser.run("scene.show('color')")
@@ -415,13 +469,22 @@ def test_in_a_browser_a_page_shows_names_and_answers_as_we_do(scene, page, tmp_p
         browser.run("get('all').click()")
         y, x = np.argwhere((truth == 3) & (shares > 0.8))[0].tolist()
         browser.click(3 * x + 1.5, 3 * y + 1.5)
-        assert browser.run("document.querySelector('#legend button[aria-pressed=true] span').textContent") == "sofa"
+        assert (
+            browser.run(
+                "document.querySelector('#legend button[aria-pressed=true] span').textContent"
+            )
+            == "sofa"
+        )
         # the mouse orbits, the wheel comes closer, keys fly
         eyes = [browser.run("camera.eye")]
         browser.drag((400, 300), (520, 330))
         eyes.append(browser.run("camera.eye"))
-        browser.call("Input.dispatchMouseEvent", type="mouseWheel", x=400, y=300, deltaX=0, deltaY=-200)
-        eyes.append(browser.run("new Promise(done => requestAnimationFrame(() => done(camera.eye)))"))
+        browser.call(
+            "Input.dispatchMouseEvent", type="mouseWheel", x=400, y=300, deltaX=0, deltaY=-200
+        )
+        eyes.append(
+            browser.run("new Promise(done => requestAnimationFrame(() => done(camera.eye)))")
+        )
         browser.key("w", True)
         browser.run("new Promise(done => setTimeout(done, 500))")
         browser.key("w", False)
@@ -442,7 +505,9 @@ def test_in_a_browser_a_path_is_saved_and_a_link_leads_back(scene, page, tmp_pat
         browser.drag((300, 300), (420, 330))
         browser.run("get('keep').click(); get('link').click()")
         turn, eye, link = browser.run("[camera.turn, camera.eye, location.href]")
-        written = "new Promise(done => { offer = blob => done(blob.text()); get('write').click(); })"
+        written = (
+            "new Promise(done => { offer = blob => done(blob.text()); get('write').click(); })"
+        )
         (tmp_path / "room.json").write_text(browser.run(written))
         browser.screenshot(tmp_path / "path.png")
         keys, center = read_cameras(tmp_path / "room.json"), held_in(page)[0]["center"]
@@ -455,7 +520,10 @@ def test_in_a_browser_a_path_is_saved_and_a_link_leads_back(scene, page, tmp_pat
         browser.run("scene.ready")
         np.testing.assert_allclose(browser.run("camera.turn"), turn, atol=1e-5)
         np.testing.assert_allclose(browser.run("camera.eye"), eye, atol=1e-5)
-        told = "new Promise(done => addEventListener('hashchange', () => done(get('kept').textContent)))"
+        told = (
+            "new Promise(done => addEventListener('hashchange', () => "
+            "done(get('kept').textContent)))"
+        )
         assert "leads to no camera" in browser.run(f"location.hash = '#camera=3'; {told}")
         assert browser.complaints == []
 
@@ -463,7 +531,9 @@ def test_in_a_browser_a_path_is_saved_and_a_link_leads_back(scene, page, tmp_pat
 @pytest.mark.slow
 @in_a_browser
 def test_in_a_browser_a_page_answers_each_word_as_asking_does(calibrated, tmp_path):
-    """Scores, what the cut selects, and whether the scene has it at all; features and words are quantised."""
+    """Scores, what the cut selects, and whether the scene has it at all; features and words are
+    quantised.
+    """
     _, opened, page = calibrated
     with driven(tmp_path) as browser:
         browser.open(page, 640, 480)
@@ -485,11 +555,16 @@ def test_in_a_browser_a_page_answers_each_word_as_asking_does(calibrated, tmp_pa
         assert [url for url in browser.requested if not url.startswith("blob:")] == [page.as_uri()]
 
 
-LANDED = "new Promise(done => { const wait = () => flight ? setTimeout(wait, 50) : done(true); wait(); })"
+LANDED = (
+    "new Promise(done => { const wait = () => flight ? setTimeout(wait, 50) : done(true); "
+    "wait(); })"
+)
 
 
 def black_edges(browser, path):
-    """The share of black pixels at each edge of what the browser shows: top, bottom, left, right."""
+    """The share of black pixels at each edge of what the browser shows: top, bottom, left,
+    right.
+    """
     browser.screenshot(path)
     with Image.open(path) as image:
         black = np.asarray(image.convert("L")) < 8
@@ -504,12 +579,19 @@ def test_in_a_browser_asking_flies_to_what_lies_behind_the_camera(calibrated, tm
     with driven(tmp_path) as browser:
         browser.open(page, *size)
         browser.run("scene.ready")
-        browser.run("get('panel').style.display = 'none'; scene.look(1); new Promise(done => setTimeout(done, 500))")
-        assert max(black_edges(browser, tmp_path / "before.png")) < 0.2  # nor above and below on a phone
+        browser.run(
+            "get('panel').style.display = 'none'; scene.look(1); new Promise(done => "
+            "setTimeout(done, 500))"
+        )
+        # nor above and below on a phone
+        assert max(black_edges(browser, tmp_path / "before.png")) < 0.2
         for word in ("sofa", "chair"):
             browser.run("scene.look(1); turned(Math.PI, 0, camera.eye); moved()")
             browser.run(f"scene.ask('{word}'); {LANDED}")
-            means = held.parameters["means"][held.labels == LABELS.index(word)] - held_in(page)[0]["center"]
+            means = (
+                held.parameters["means"][held.labels == LABELS.index(word)]
+                - held_in(page)[0]["center"]
+            )
             turn, eye = (np.array(browser.run(f"camera.{part}")) for part in ("turn", "eye"))
             seen = (means - eye) @ turn.reshape(3, 3).T
             fx, fy, cx, cy = browser.run("shown().lens")
@@ -521,9 +603,11 @@ def test_in_a_browser_asking_flies_to_what_lies_behind_the_camera(calibrated, tm
             with Image.open(tmp_path / f"{word}.png") as image:
                 third = size[0] // 3, size[1] // 3, 2 * size[0] // 3, 2 * size[1] // 3
                 middle = np.asarray(image.convert("RGB").crop(third))
-            assert np.ptp(middle.astype(int), axis=-1).mean() > 30  # heat is coloured, all else is grey
+            # heat is coloured, all else is grey
+            assert np.ptp(middle.astype(int), axis=-1).mean() > 30
             eye = browser.run("camera.eye")
-            assert browser.run(f"scene.ask('{word}'); {LANDED}.then(() => camera.eye)") == eye  # it is seen already
+            # it is seen already
+            assert browser.run(f"scene.ask('{word}'); {LANDED}.then(() => camera.eye)") == eye
         assert browser.run("scene.ask('zebra')") is None
         assert browser.run("[mode, asked, get('scale').hidden]") == ["color", None, True]
         assert "has no" in browser.run("get('answer').textContent")
@@ -532,7 +616,9 @@ def test_in_a_browser_asking_flies_to_what_lies_behind_the_camera(calibrated, tm
 
 @pytest.mark.slow
 @in_a_browser
-def test_in_a_browser_where_all_labels_are_hidden_it_says_so_and_shows_them_again(scene, page, tmp_path):
+def test_in_a_browser_where_all_labels_are_hidden_it_says_so_and_shows_them_again(
+    scene, page, tmp_path
+):
     with driven(tmp_path) as browser:
         browser.open(page, 960, 720)
         browser.run("scene.ready")
@@ -561,10 +647,16 @@ def test_in_a_browser_clicks_label_points_that_teaching_reads(scene, page, tmp_p
         browser.open(page, 960, 720)
         browser.run("scene.ready")
         browser.run("scene.look(1); new Promise(done => setTimeout(done, 500))")
-        browser.run("document.querySelectorAll('details').forEach(part => { part.open = true; }); get('place').click()")
+        browser.run(
+            "document.querySelectorAll('details').forEach(part => { part.open = true; }); "
+            "get('place').click()"
+        )
         click = [(3 * x + 1.5, 3 * y + 1.5) for x, y in pixels]
         browser.click(*click[0])
-        assert browser.run("[get('placed').textContent, points.length]") == ["Type a word first.", 0]
+        assert browser.run("[get('placed').textContent, points.length]") == [
+            "Type a word first.",
+            0,
+        ]
         browser.run("get('name').value = 'sofa, red'")
         for x, y in [*click, click[0]]:
             browser.click(x, y)
@@ -585,21 +677,24 @@ def test_in_a_browser_clicks_label_points_that_teaching_reads(scene, page, tmp_p
 @pytest.mark.slow
 @in_a_browser
 def test_in_a_browser_moving_among_20000_gaussians_and_asking_stay_cheap(page, tmp_path):
-    """In seconds of CPU time, all threads together, which others on the machine change less than the clock's; drawn in
-    software, where two quiet cores give 20 frames/s at 0.1 s each. Instances drawn one by one took 0.3 s more.
+    """In seconds of CPU time, all threads together, which others on the machine change less than
+    the clock's; drawn in software, where two quiet cores give 20 frames/s at 0.1 s each. Instances
+    drawn one by one took 0.3 s more.
     """
     with driven(tmp_path) as browser:
         browser.open(page, 640, 480)
         browser.run("scene.ready")
         browser.key("ArrowLeft", True)
-        browser.run("new Promise(done => setTimeout(done, 3000))")  # until the resolution has settled
+        # until the resolution has settled
+        browser.run("new Promise(done => setTimeout(done, 3000))")
         frames = browser.run("scene.frames")
         browser.run("new Promise(done => setTimeout(done, 5000))")
         drawn = browser.run("scene.frames") - frames
         browser.key("ArrowLeft", False)
         print(f"{drawn / 5:.1f} frames/s of the loop, side × {browser.run('scale'):.2f}")
         assert drawn > 0
-        browser.run("frame = () => {}; new Promise(done => setTimeout(done, 1000))")  # the loop rests
+        # the loop rests
+        browser.run("frame = () => {}; new Promise(done => setTimeout(done, 1000))")
         browser.run("canvas.width = 160; canvas.height = 120; scene.ask('seat')")
         draw = """for (let k = 0; k < COUNT; k++) { turned(0.02, 0, camera.eye); const what = seen(camera);
           drawing.order(sorted(splats.means, splats.reach, sortable(what))); drawing.draw(what, false);
@@ -627,6 +722,8 @@ def test_in_a_browser_a_foreign_splat_is_shown_on_a_narrow_screen(tmp_path, dark
         browser.open(out, 390, 800, dark=dark)
         browser.run("scene.ready")
         assert browser.run("document.documentElement.scrollWidth") <= 390
-        brightness = browser.run("scene.picture(0).reduce((sum, value) => sum + value) / (640 * 480)")
+        brightness = browser.run(
+            "scene.picture(0).reduce((sum, value) => sum + value) / (640 * 480)"
+        )
         assert brightness > 300  # alpha alone: 255
         assert browser.complaints == []

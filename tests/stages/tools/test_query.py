@@ -36,9 +36,13 @@ def vectors(names):
 
 
 def write_toy(folder, teacher=None):
-    """A chair left, a sofa in the middle, a wall right; four of the teacher's six channels, or codes of labels."""
+    """A chair left, a sofa in the middle, a wall right; four of the teacher's six channels, or
+    codes of labels.
+    """
     rng = np.random.default_rng(0)
-    means = np.concatenate([rng.normal([x, 0, 4], 0.15, (N, 3)) for x in (-1.2, 0, 1.2)]).astype(np.float32)
+    means = np.concatenate([rng.normal([x, 0, 4], 0.15, (N, 3)) for x in (-1.2, 0, 1.2)]).astype(
+        np.float32
+    )
     labels = np.repeat(np.arange(3), N).astype(np.int32)
     matrix = np.eye(6, 4, dtype=np.float32)
     channels = ChannelMap(matrix, matrix.T.copy(), np.ones(6, np.float32), "toy", {})
@@ -51,13 +55,18 @@ def write_toy(folder, teacher=None):
     }  # fmt: skip
     K = np.array([[40, 0, SIZE[1] / 2], [0, 40, SIZE[0] / 2], [0, 0, 1]], float)
     views, Ks, poses = ["a.png", "b.png"], np.stack([K, K]), np.stack([np.eye(4)] * 2)
-    scene = Scene(parameters, Cameras(views, Ks, poses, SIZE[1], SIZE[0]), np.arange(n), labels, LABELS, known)
+    scene = Scene(
+        parameters, Cameras(views, Ks, poses, SIZE[1], SIZE[0]), np.arange(n), labels, LABELS, known
+    )
     published(folder / "export", scene)
     capture = Capture(views, np.zeros((2, *SIZE, 3), np.uint8), Ks, poses, np.array([False, True]))
     published(folder / "ingest", capture)
     convention, model = {"kind": "labels"}, None
     if teacher is not None:
-        convention, model = {"kind": "onnx", "output": "features", "sha256": sha256_file(teacher)}, str(teacher)
+        convention, model = (
+            {"kind": "onnx", "output": "features", "sha256": sha256_file(teacher)},
+            str(teacher),
+        )
     features = Features(
         views, np.zeros((2, 2, 2, known.shape[1]), np.float16), LABELS, known, convention=convention,
         channels=None if teacher is None else channels,
@@ -100,7 +109,16 @@ def test_a_word_is_found_in_the_scene_and_drawn_by_render(folder, tmp_path):
     assert not answer.calibrated and answer.presence is None
     assert answer.scores[: 2 * N].min() > 0.9
     assert answer.scores[2 * N :].max() < 0.1
-    command = ["render", "words", "--what", "relevancy", "--query", "seat", "--out", str(tmp_path / "seats")]
+    command = [
+        "render",
+        "words",
+        "--what",
+        "relevancy",
+        "--query",
+        "seat",
+        "--out",
+        str(tmp_path / "seats"),
+    ]
     assert CliRunner().invoke(main, command).exit_code == 0
     heat = np.asarray(Image.open(tmp_path / "seats/relevancy/b.png.png")).astype(int)
     colored = np.ptp(heat, axis=-1) > 40

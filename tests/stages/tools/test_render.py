@@ -1,4 +1,6 @@
-"""`chebsplat render` and `chebsplat cameras`: frames are those that are evaluated, kept, and of the asked cameras."""
+"""`chebsplat render` and `chebsplat cameras`: frames are those that are evaluated, kept, and of the
+asked cameras.
+"""
 
 import json
 import os
@@ -53,21 +55,45 @@ def picture(path):
 @pytest.mark.xdist_group("toy")
 def test_frames_are_what_is_evaluated_and_what_python_renders(scene, folder, toy, tmp_path):
     word = scene.label_names[0]
-    run("render", folder, "--what", "color,labels,depth,relevancy", "--query", word, "--out", tmp_path / "frames")
+    run(
+        "render",
+        folder,
+        "--what",
+        "color,labels,depth,relevancy",
+        "--query",
+        word,
+        "--out",
+        tmp_path / "frames",
+    )
     figures = Evaluation.read(toy["evaluate"])
     for name, render in zip(figures.figures["names"], figures.pictures["renders"], strict=True):
         np.testing.assert_array_equal(picture(tmp_path / f"frames/color/{name}.png"), render)
     camera = scene.cameras[1]
     shown = scene.render(camera)
-    np.testing.assert_array_equal(np.load(tmp_path / f"frames/depth/{camera.name}.npy"), shown.depth)
-    np.testing.assert_array_equal(picture(tmp_path / f"frames/labels/{camera.name}.png").astype(int) - 1, shown.labels)
+    np.testing.assert_array_equal(
+        np.load(tmp_path / f"frames/depth/{camera.name}.npy"), shown.depth
+    )
+    np.testing.assert_array_equal(
+        picture(tmp_path / f"frames/labels/{camera.name}.png").astype(int) - 1, shown.labels
+    )
     assert picture(tmp_path / f"frames/relevancy/{camera.name}.png").shape == shown.color.shape
     assert len(list((tmp_path / "frames/color").iterdir())) == len(scene.cameras)
 
 
 @pytest.mark.xdist_group("toy")
 def test_frames_that_are_there_and_whole_are_kept(folder, tmp_path):
-    command = ("render", folder, "--path", "orbit", "--frames", 5, "--size", "40x30", "--out", tmp_path / "frames")
+    command = (
+        "render",
+        folder,
+        "--path",
+        "orbit",
+        "--frames",
+        5,
+        "--size",
+        "40x30",
+        "--out",
+        tmp_path / "frames",
+    )
     run(*command)
     frames = sorted((tmp_path / "frames/color").iterdir())
     before = [(path.read_bytes(), path.stat().st_mtime_ns) for path in frames]
@@ -76,15 +102,27 @@ def test_frames_that_are_there_and_whole_are_kept(folder, tmp_path):
     frames[2].write_bytes(before[2][0][:-20])
     run(*command)
     assert [path.read_bytes() for path in frames] == [content for content, _ in before]
-    kept = [path.stat().st_mtime_ns == stamp for path, (_, stamp) in zip(frames, before, strict=True)]
+    kept = [
+        path.stat().st_mtime_ns == stamp for path, (_, stamp) in zip(frames, before, strict=True)
+    ]
     assert kept == [True, False, False, True, True]
     refused = run(*command[:3], "capture", *command[4:], code=2)
     assert "frames of another scene, path, size or query" in refused.stderr
 
 
 def killed_and_resumed(folder, out, cameras, size, after):
-    """Files of frames that were begun, killed when `after` of them were there, and finished by the same command."""
-    command = [sys.executable, "-m", "chebsplat.pipelines.cli", "render", str(folder), "--path", str(cameras)]
+    """Files of frames that were begun, killed when `after` of them were there, and finished by the
+    same command.
+    """
+    command = [
+        sys.executable,
+        "-m",
+        "chebsplat.pipelines.cli",
+        "render",
+        str(folder),
+        "--path",
+        str(cameras),
+    ]
     command += ["--size", size, "--out", str(out)]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     while process.poll() is None and len(list(out.glob("color/view*"))) < after:
@@ -103,7 +141,9 @@ def hundred(scene, path):
     """A cameras.json of a hundred views: the capture's, over and over, each moved a little."""
     rows = camera_files.gs_cameras(scene.cameras)
     rows = [rows[k % len(rows)] | {"id": k, "img_name": f"view{k:03d}"} for k in range(100)]
-    rows = [row | {"position": [p + 0.001 * k for p in row["position"]]} for k, row in enumerate(rows)]
+    rows = [
+        row | {"position": [p + 0.001 * k for p in row["position"]]} for k, row in enumerate(rows)
+    ]
     path.write_text(json.dumps(rows))
     return path
 
@@ -120,10 +160,17 @@ def test_a_hundred_frames_outlive_a_kill_and_equal_evaluates_renders(scene, fold
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = rotation, -rotation @ row["position"]
         zoom = width / row["width"]
-        K = np.array([[row["fx"] * zoom, 0, row["cx"] * zoom], [0, row["fy"] * zoom, row["cy"] * zoom], [0, 0, 1]])
+        K = np.array(
+            [
+                [row["fx"] * zoom, 0, row["cx"] * zoom],
+                [0, row["fy"] * zoom, row["cy"] * zoom],
+                [0, 0, 1],
+            ]
+        )
         image, _ = renderer.render(Camera("", K, pose, width, height).view(), with_features=True)
         frame = picture(tmp_path / f"frames/color/view{k:03d}.png")
-        # A pose goes through text and an SVD: float32 of it may differ in the last bit, a pixel's rounding then by one.
+        # A pose goes through text and an SVD: float32 of it may differ in the last bit, a pixel's
+        # rounding then by one.
         differing = np.abs(frame.astype(int) - image)
         assert differing.max() <= 1 and differing.mean() / 255 < 1e-6
 
@@ -144,11 +191,18 @@ def test_written_cameras_are_read_back(tmp_path, read):
         model = read_model(tmp_path / "sparse/0")
         for camera, image in zip(cameras, model.images, strict=True):
             np.testing.assert_allclose(image.pose, camera.cam_from_world, atol=TOLERANCE)
-            assert model.cameras[image.camera] == ("PINHOLE", camera_files.intrinsics(camera), 320, 240)
+            assert model.cameras[image.camera] == (
+                "PINHOLE",
+                camera_files.intrinsics(camera),
+                320,
+                240,
+            )
             assert image.name == f"{camera.name}.png"
     else:
         for camera, found in zip(cameras, camera_files.read_cameras(tmp_path / read), strict=True):
-            np.testing.assert_allclose(found.cam_from_world, camera.cam_from_world, atol=TOLERANCE * 10)
+            np.testing.assert_allclose(
+                found.cam_from_world, camera.cam_from_world, atol=TOLERANCE * 10
+            )
             np.testing.assert_array_equal(found.K, camera.K)
             assert (found.name, found.width, found.height) == (camera.name, 320, 240)
     with pytest.raises(ConfigError, match="exists"):
@@ -161,9 +215,14 @@ def test_written_cameras_are_read_back(tmp_path, read):
         ("{}", "neither a transforms.json"),
         ("[]", "lists no cameras"),
         ('[{"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]', "'position' is missing"),
-        ('{"frames": [{"file_path": "a.png", "w": 4, "h": 3, "fl_x": 4, "transform_matrix": [1]}]}', "not usable"),
         (
-            '[{"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]], "position": [0, 0, 0], "width": 8, "height": 8, '
+            '{"frames": [{"file_path": "a.png", "w": 4, "h": 3, "fl_x": 4, "transform_matrix": '
+            "[1]}]}",
+            "not usable",
+        ),
+        (
+            '[{"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]], "position": [0, 0, 0], "width": 8, '
+            '"height": 8, '
             '"fx": 8, "fy": 8}]',
             "not a rotation",
         ),
@@ -176,7 +235,9 @@ def test_a_file_of_no_cameras_is_said(tmp_path, content, message):
 
 
 def ring(n=12, tilt=0.3):
-    """Cameras on a circle of radius 3 about (1, 2, 0), which look at its middle from above; z is up."""
+    """Cameras on a circle of radius 3 about (1, 2, 0), which look at its middle from above; z is
+    up.
+    """
     K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
     for angle in np.arange(n) * 2 * np.pi / n:
         eye = np.array([1 + 3 * np.cos(angle), 2 + 3 * np.sin(angle), 3 * tilt])
@@ -187,11 +248,15 @@ def ring(n=12, tilt=0.3):
 def test_an_orbit_goes_round_what_the_cameras_look_at():
     frames = camera_paths.orbit(list(ring()), 8)
     for frame in frames:
-        np.testing.assert_allclose(frame.cam_from_world @ [1, 2, 0, 1], [0, 0, np.hypot(3, 0.9), 1], atol=1e-9)
+        np.testing.assert_allclose(
+            frame.cam_from_world @ [1, 2, 0, 1], [0, 0, np.hypot(3, 0.9), 1], atol=1e-9
+        )
         assert frame.cam_from_world[1, 2] < 0  # its top points up
     places = np.stack([frame.position for frame in frames])
     np.testing.assert_allclose(places[:, 2], 0.9)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), 6 * np.sin(np.pi / 8), rtol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(np.diff(places, axis=0), axis=1), 6 * np.sin(np.pi / 8), rtol=1e-6
+    )
     assert len(camera_paths.orbit([next(ring())] * 2, 3)) == 3  # in one place, looking one way
 
 
@@ -228,23 +293,45 @@ def test_what_cannot_be_rendered_is_said(scene, folder, toy, tmp_path):
     ):
         with pytest.raises(ConfigError, match=message):
             kinds_of(text, scene, asked)
-    assert "orbit, capture or a .json" in run("render", folder, "--path", "walk", "--out", tmp_path, code=2).stderr
+    assert (
+        "orbit, capture or a .json"
+        in run("render", folder, "--path", "walk", "--out", tmp_path, code=2).stderr
+    )
     (tmp_path / "x").mkdir()
     (tmp_path / "x/notes.txt").write_text("mine")
-    assert "something else than frames" in run("render", folder, "--out", tmp_path / "x", code=2).stderr
+    assert (
+        "something else than frames"
+        in run("render", folder, "--out", tmp_path / "x", code=2).stderr
+    )
 
 
 @pytest.mark.xdist_group("toy")
 def test_a_video_has_a_frame_for_every_camera(folder, tmp_path):
     av = pytest.importorskip("av")
     out = tmp_path / "orbit.mp4"
-    run("render", folder, "--path", "orbit", "--frames", 6, "--what", "depth", "--size", "64x48", "--out", out)
+    run(
+        "render",
+        folder,
+        "--path",
+        "orbit",
+        "--frames",
+        6,
+        "--what",
+        "depth",
+        "--size",
+        "64x48",
+        "--out",
+        out,
+    )
     with av.open(str(out)) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert len(frames) == 6 and frames[0].shape == (48, 64, 3)
     assert os.listdir(tmp_path) == ["orbit.mp4"]  # the frames are gone with the work
     assert "exists" in run("render", folder, "--out", out, code=2).stderr
-    assert "even" in run("render", folder, "--size", "63x48", "--out", tmp_path / "odd.mp4", code=2).stderr
+    assert (
+        "even"
+        in run("render", folder, "--size", "63x48", "--out", tmp_path / "odd.mp4", code=2).stderr
+    )
     both = run("render", folder, "--what", "color,depth", "--out", tmp_path / "two.mp4", code=2)
     assert "a video shows one of color,depth" in both.stderr
 

@@ -1,4 +1,6 @@
-"""Up is where the user says, or where cameras or the floor are; pages, orbits, meshes and scenes follow it."""
+"""Up is where the user says, or where cameras or the floor are; pages, orbits, meshes and scenes
+follow it.
+"""
 
 import json
 
@@ -20,7 +22,10 @@ from chebsplat.stages.tools.mesh import turned
 from tests.stages.tools.test_page import held_in
 from tests.stages.tools.test_render import ring
 
-TURNS = [Rotation.random(random_state=seed).as_matrix() for seed in range(4)] + [np.eye(3), np.diag([1.0, -1, -1])]
+TURNS = [Rotation.random(random_state=seed).as_matrix() for seed in range(4)] + [
+    np.eye(3),
+    np.diag([1.0, -1, -1]),
+]
 
 
 def flat(rng, low, high, axis, n):
@@ -33,8 +38,14 @@ def flat(rng, low, high, axis, n):
 
 
 def furnished(turn, rng):
-    """A room of 5 x 4 x 2.5 m, a table and a chest in it, and a tenth of blobs, z turned to `turn` z."""
-    boxes = [((0, 0, 0), (5, 4, 2.5), 2500), ((1, 1, 0.7), (2.4, 1.8, 0.74), 200), ((3, 3, 0), (4, 3.8, 1), 300)]
+    """A room of 5 x 4 x 2.5 m, a table and a chest in it, and a tenth of blobs, z turned to `turn`
+    z.
+    """
+    boxes = [
+        ((0, 0, 0), (5, 4, 2.5), 2500),
+        ((1, 1, 0.7), (2.4, 1.8, 0.74), 200),
+        ((3, 3, 0), (4, 3.8, 1), 300),
+    ]
     means, turns = [], []
     for low, high, n in boxes:
         for axis in range(3):
@@ -48,8 +59,16 @@ def furnished(turn, rng):
     n = len(means)
     log_scales = np.tile(np.log([0.1, 0.08, 0.004]), (n, 1))
     log_scales[::10] = np.log(0.05)
-    raw = {"means": means, "quats": Rotation.from_matrix(turns).as_quat(scalar_first=True), "log_scales": log_scales}
-    raw |= {"logit_opacities": np.full(n, 3.0), "sh0": np.zeros((n, 1, 3)), "shN": np.zeros((n, 15, 3))}
+    raw = {
+        "means": means,
+        "quats": Rotation.from_matrix(turns).as_quat(scalar_first=True),
+        "log_scales": log_scales,
+    }
+    raw |= {
+        "logit_opacities": np.full(n, 3.0),
+        "sh0": np.zeros((n, 1, 3)),
+        "shN": np.zeros((n, 15, 3)),
+    }
     return {name: values.astype(np.float32) for name, values in raw.items()}
 
 
@@ -95,7 +114,9 @@ def run(*arguments):
     assert done.exit_code == 0, done.output
 
 
-@pytest.mark.parametrize(("asked", "wanted"), [("z", [0, 0, 1]), ("-x", [-1, 0, 0]), ("auto", TURNS[0][:, 2])])
+@pytest.mark.parametrize(
+    ("asked", "wanted"), [("z", [0, 0, 1]), ("-x", [-1, 0, 0]), ("auto", TURNS[0][:, 2])]
+)
 def test_page_and_scene_of_a_splat_stand_upright(tmp_path, asked, wanted):
     ply = tmp_path / "theirs.ply"
     write_ply(ply, furnished(TURNS[0], np.random.default_rng(0)), 0)
@@ -122,16 +143,24 @@ def test_page_and_orbit_of_a_scene_take_up_as_given(scene, tmp_path):
     assert np.ptp(heights) < 1e-6  # a level round
     level = np.array([np.array(row["rotation"])[:, 0] for row in rows]) @ np.array([-1, 0, 1])
     assert np.abs(level).max() < 1e-6  # horizons are level
-    done = CliRunner().invoke(main, ["render", str(scene), "--up", "z", "--out", str(tmp_path / "no")])
+    done = CliRunner().invoke(
+        main, ["render", str(scene), "--up", "z", "--out", str(tmp_path / "no")]
+    )
     assert done.exit_code == 2 and "add --path orbit" in done.output
 
 
 def test_orbits_without_up_are_as_before_and_with_it_go_round_it():
     cameras = list(ring())
     plain = camera_paths.orbit(cameras, 5)
-    same = camera_paths.orbit(cameras, 5, camera_paths.common_up(np.stack([c.cam_from_world for c in cameras]))[0])
-    np.testing.assert_array_equal([c.cam_from_world for c in plain], [c.cam_from_world for c in same])
-    turned_round = np.stack([c.cam_from_world for c in camera_paths.orbit(cameras, 5, np.array([0.0, 0.6, 0.8]))])
+    same = camera_paths.orbit(
+        cameras, 5, camera_paths.common_up(np.stack([c.cam_from_world for c in cameras]))[0]
+    )
+    np.testing.assert_array_equal(
+        [c.cam_from_world for c in plain], [c.cam_from_world for c in same]
+    )
+    turned_round = np.stack(
+        [c.cam_from_world for c in camera_paths.orbit(cameras, 5, np.array([0.0, 0.6, 0.8]))]
+    )
     assert np.ptp(centers(turned_round) @ [0, 0.6, 0.8]) < 1e-9
 
 
@@ -139,7 +168,9 @@ def test_orbits_without_up_are_as_before_and_with_it_go_round_it():
 def test_a_mesh_is_turned_so_that_up_is_what_its_format_has(suffix, wanted):
     up_is = np.array([0.6, 0, -0.8])
     corners = np.array([[0, 0, 0], up_is, [0, 1, 0], np.cross(up_is, [0, 1, 0])])
-    found = turned(Mesh(corners, np.array([[0, 1, 2]]), np.zeros((4, 3), np.uint8)), up_is, suffix).vertices
+    found = turned(
+        Mesh(corners, np.array([[0, 1, 2]]), np.zeros((4, 3), np.uint8)), up_is, suffix
+    ).vertices
     np.testing.assert_allclose(found[1], wanted, atol=1e-6)
     np.testing.assert_allclose(found[1:] @ found[1:].T, np.eye(3), atol=1e-6)
     assert np.linalg.det(found[1:]) * np.linalg.det(corners[1:]) > 0  # turned, not mirrored
