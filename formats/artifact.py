@@ -1,8 +1,7 @@
 """Artifacts on disk: published whole or not at all, described by a manifest, verified on reading.
 
 An artifact is a directory holding `artifact.json` and the files it lists. `publish` writes into a
-hidden
-sibling, puts the manifest last, and renames: a reader sees a finished artifact or none.
+hidden sibling, puts the manifest last, and renames: a reader sees a finished artifact or none.
 """
 
 from __future__ import annotations
@@ -31,13 +30,14 @@ def sha256_file(path: Path) -> str:
 
 
 def is_published(path: Path) -> bool:
-    """Whether a folder holds a manifest: `publish` has ended there."""
+    """True where a folder holds a manifest: `publish` has ended there."""
     return os.path.isfile(path / MANIFEST)
 
 
 def copy(path: Path, out: Path, manifest: Manifest) -> None:
-    """Publish the artifact `path`, whose manifest was read, at `out` as well. Raises InputError if
-    it has changed.
+    """Publish the artifact `path`, whose manifest was read, at `out` as well.
+
+    Raises: InputError if it has changed.
     """
     expected = manifest.files
     with publish(out, manifest) as tmp:
@@ -101,9 +101,7 @@ def _make(tmp: Path, out: Path) -> None:
 
 
 def _put(tmp: Path, out: Path, manifest: Manifest, force: bool) -> None:
-    """Rename `tmp` to `out`; what `check_place` lets be replaced is renamed before: no one sees
-    half of either.
-    """
+    """Rename `tmp` to `out`, and before it away what `check_place` lets it replace."""
     replaced = tmp.with_name(f".tmp-{out.name}-old-{os.getpid()}")
     try:
         os.rename(tmp, out)
@@ -122,8 +120,7 @@ def _put(tmp: Path, out: Path, manifest: Manifest, force: bool) -> None:
 
 
 def check_place(out: Path, schema: str, key: str, force: bool = False) -> None:
-    """Whether a stage may put its artifact at `out`, where nothing whole of it stands, or where
-    `force` replaces it.
+    """Refuse `out` for an artifact unless nothing whole stands there, or `force` may replace it.
 
     Choices: a folder that bears the artifact's key is its own, whatever a crash has left of it.
       Elsewhere only an artifact of the same schema goes, by `force`, and with nothing beside what
@@ -260,9 +257,7 @@ def digest(value: Mapping[str, Any]) -> str:
 
 
 def discard(scratch: Path) -> None:
-    """Remove a scratch directory. Raises ValueError if it is none: nothing of the user's is ever
-    removed.
-    """
+    """Remove a scratch directory. Raises ValueError if it is none, so that no user's file goes."""
     if not scratch.name.startswith((".part-", ".tmp-")):
         raise ValueError(f"{scratch} is no scratch directory")
     if scratch.exists():
@@ -270,9 +265,7 @@ def discard(scratch: Path) -> None:
 
 
 def write_document(path: Path, value: Any) -> None:
-    """Write `value` as JSON. Raises ValueError on a value JSON or UTF-8 does not have, nan among
-    them.
-    """
+    """Write `value` as JSON. Raises ValueError on nan, and on what UTF-8 cannot hold."""
     path.write_text(
         json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )

@@ -1,6 +1,4 @@
-"""`descriptors/2`: points of a scene's surface, and the shape about each: what the point encoder
-sees.
-"""
+"""`descriptors/2`: points of a scene's surface and the shape about each, the encoder's input."""
 
 from __future__ import annotations
 

@@ -1,10 +1,9 @@
-"""Files one by one. Reading what people or other programs wrote: regular, of bounded size, UTF-8,
-and parsed or named in a clear error. Writing a file whole or not at all; a disk that is full, over
-quota or read-only said in one line.
+"""Files one by one: others' files read with checks of type, size and syntax, ours written
+atomically.
 
 Every reader of such a file goes through here, so that a pipe, a device, a folder, a file of
-gigabytes, bytes that are no text and a document nested a thousand levels deep are each refused at
-once, in the same words everywhere.
+gigabytes, bytes that are no text and a document nested a thousand levels deep are refused at once,
+in the same words everywhere. A disk that is full, over quota or read-only is reported in one line.
 """
 
 from __future__ import annotations
@@ -77,9 +76,7 @@ def parse_json(
     error: type[ChebsplatError] = InputError,
     finite: bool = False,
 ) -> Any:
-    """The value in a JSON file; `finite`: without nan or infinities, as JSON really is. Raises
-    `error`.
-    """
+    """The value in a JSON file; `finite`: nan and infinities are refused. Raises `error`."""
     text = read_text(path, remedy, error)
     try:
         strict: dict[str, Any] = (
@@ -97,9 +94,7 @@ def parse_json(
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object whose keys differ: of two values of one key neither is what its writer
-    meant.
-    """
+    """A JSON object of different keys: of two values of one key neither may be the intended one."""
     value = dict(pairs)
     if len(value) < len(pairs):
         twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
@@ -130,8 +125,7 @@ def parse_toml(
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, which a block fills; it becomes `path` when the block ends
-    without an error.
+    """A temporary path beside `path`, renamed to `path` when the block ends without an error.
 
     The file is there whole or not at all, whatever happens to the machine. A block that fails
     leaves what stood there before. The temporary name keeps the ending, by which some libraries
@@ -166,7 +160,7 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def explained(folder: Path, scratch: bool = False) -> Iterator[None]:
-    """Turn refusals of the disk within into a DiskFailure that names the error's file, or `folder`.
+    """Turn the disk's refusals into a DiskFailure that names the error's file, or `folder`.
 
     Args: scratch: `folder` holds what is being written and nothing else; the message has its bytes.
     Raises: DiskFailure; InputError naming a file that may not be read.

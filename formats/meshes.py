@@ -26,8 +26,8 @@ GLTF_FLOAT, GLTF_UINT, GLTF_UBYTE, GLTF_VERTICES, GLTF_INDICES = 5126, 5125, 512
 
 
 class Mesh(NamedTuple):
-    """vertices f32 [V, 3] scene units; triangles i32 [T, 3]; colors u8 [V, 3]; labels i32 [V], -1:
-    none, or None.
+    """vertices f32 [V, 3] scene units; triangles i32 [T, 3]; colors u8 [V, 3]; labels i32 [V] or
+    None.
     """
 
     vertices: np.ndarray
@@ -37,8 +37,8 @@ class Mesh(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """depth f32 [H, W] scene units along the camera's axis, 0 where unknown; color u8 [H, W, 3]; K
-    [3, 3]; pose [4, 4] world to camera.
+    """depth f32 [H, W] scene units, z, 0 unknown; color u8 [H, W, 3]; K [3, 3]; pose world to
+    camera.
     """
 
     depth: np.ndarray
@@ -48,10 +48,9 @@ class Frame(NamedTuple):
 
 
 def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -> Mesh:
-    """The surface that depth images show, by a truncated signed distance on voxels of this edge,
-    scene units.
+    """The surface of depth images, by a truncated signed distance on voxels of this edge.
 
-    Args: open3d: the module; farthest: depth beyond it is not looked at.
+    Args: open3d: the module; voxel, farthest: scene units, depth beyond which is ignored.
     Choices: truncated at four voxels; a voxel counts that more than LEAST_WEIGHT views saw. open3d
       takes the pixel that a point falls into, so that the centre of the first one is at 0.5, as
       ours is. A frame that touches no block would be an error to it, and is passed over.
@@ -61,7 +60,7 @@ def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -
     grid = open3d.t.geometry.VoxelBlockGrid(
         names, (core.float32,) * 3, widths, voxel, BLOCK, N_BLOCKS, core.Device("CPU:0")
     )
-    n_seen = 0
+    n_frames = 0
     for frame in frames:
         touched = frame.depth[::TOUCHED, ::TOUCHED]
         if not ((touched > 0) & (touched < farthest)).any():
@@ -74,21 +73,19 @@ def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -
         )
         blocks = grid.compute_unique_block_coordinates(depth, K, pose, 1.0, farthest, TRUNCATED)
         grid.integrate(blocks, depth, color, K, pose, 1.0, farthest, TRUNCATED)
-        n_seen += 1
-    found = grid.extract_triangle_mesh(LEAST_WEIGHT) if n_seen else None
-    if found is None or not len(found.vertex.positions):
+        n_frames += 1
+    mesh = grid.extract_triangle_mesh(LEAST_WEIGHT) if n_frames else None
+    if mesh is None or not len(mesh.vertex.positions):
         empty = np.zeros((0, 3))
         return Mesh(empty.astype(np.float32), empty.astype(np.int32), empty.astype(np.uint8))
-    colors = (found.vertex.colors.numpy() * 255).round().clip(0, 255).astype(np.uint8)
+    colors = (mesh.vertex.colors.numpy() * 255).round().clip(0, 255).astype(np.uint8)
     return Mesh(
-        found.vertex.positions.numpy(), found.triangle.indices.numpy().astype(np.int32), colors
+        mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.int32), colors
     )
 
 
 def meshlab() -> Any:
-    """The module that cleans meshes. Raises ConfigError where it, or a library that it is linked
-    to, is missing.
-    """
+    """The module pymeshlab. Raises ConfigError where it, or a library that it needs, is missing."""
     try:
         import pymeshlab
     except ImportError as error:  # of the package, or of a library that it is linked to
@@ -103,16 +100,14 @@ def meshlab() -> Any:
 def cleaned(
     mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: int, voxel: float
 ) -> Mesh:
-    """The mesh without what floats, its small holes closed, in at most so many triangles. Labels
-    are dropped.
+    """The mesh in at most `n_triangles`, floaters removed, small holes closed, labels dropped.
 
     Args: least_diagonal: of a connected part that stays, scene units; longest_hole: edges of a hole
-      that is closed;
-      voxel: edge of those that it was fused from, scene units.
+      that is closed; voxel: edge of those that it was fused from, scene units.
     Raises: ConfigError as `meshlab`.
     Choices: a vertex takes the colour of the nearest one before. Vertices are first clustered in
-      cubic cells, of a size that leaves what is wanted or EASY, and edges collapsed by quadrics
-      from there on: the collapse alone takes four times as long, for 0.002 of the F-score at 5 cm.
+      cubic cells, of a size that leaves n_triangles or EASY, and edges collapsed by quadrics from
+      there on: the collapse alone takes four times as long, for 0.002 of the F-score at 5 cm.
     """
     pymeshlab = meshlab()
     meshes = pymeshlab.MeshSet(verbose=False)
@@ -132,10 +127,10 @@ def cleaned(
             targetfacenum=n_triangles, preserveboundary=True, preservenormal=True
         )
     meshes.meshing_remove_unreferenced_vertices()
-    kept = meshes.current_mesh()
+    simplified = meshes.current_mesh()
     vertices, triangles = (
-        kept.vertex_matrix().astype(np.float32),
-        kept.face_matrix().astype(np.int32),
+        simplified.vertex_matrix().astype(np.float32),
+        simplified.face_matrix().astype(np.int32),
     )
     if not len(vertices):
         return Mesh(vertices.reshape(0, 3), triangles.reshape(0, 3), np.zeros((0, 3), np.uint8))
@@ -143,7 +138,7 @@ def cleaned(
 
 
 def write_mesh(path: Path, mesh: Mesh, names: list[str] | None = None) -> None:
-    """Write the mesh as .ply or .glb, by the file's name; labels with it, and what they are called.
+    """Write the mesh as .ply or .glb, by the file's name, with its labels and their names.
 
     Raises: ConfigError on another suffix.
     Choices: PLY has an int property `label`, -1 for none, and comments `label ID NAME`. GLB has

@@ -1,6 +1,4 @@
-"""The `chebsplat` command: runs, plans, studies, upkeep, uses of a finished scene, and every stage
-as a command.
-"""
+"""The `chebsplat` command: runs, plans, studies, upkeep, uses of a finished scene, every stage."""
 
 from __future__ import annotations
 
@@ -18,9 +16,7 @@ from chebsplat.stages.runtime.stopping import streams
 
 
 class Commands(Guarded):
-    """Stages are listed from their table and imported only when called, so that --help stays
-    instant.
-    """
+    """Lists stages from their table and imports one when it is called: --help stays instant."""
 
     def main(self, *arguments: Any, **options: Any) -> Any:
         with streams(say):
@@ -52,7 +48,7 @@ class Commands(Guarded):
 
 
 def run_stage(name: str, job: Any) -> None:
-    """Import a stage's module only now, since it brings torch, and run it."""
+    """Import a stage's module, which brings torch, and run it."""
     import_module(f"chebsplat.stages.{name}").run(job)
 
 

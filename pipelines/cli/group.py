@@ -1,6 +1,5 @@
-"""Logging and exit codes of commands: the log goes to stderr; what a command returns is its exit
-code; a typed error or a stop becomes a line on stderr and a code. Options that several commands
-take.
+"""Logging, exit codes and shared options of commands: the log goes to stderr; a command's result is
+its exit code; a typed error or a stop becomes a line on stderr and a code.
 """
 
 from __future__ import annotations
@@ -41,9 +40,7 @@ class _Lines(logging.Formatter):
 
 @contextmanager
 def logged(context: click.Context) -> Iterator[None]:
-    """Send the log to stderr within; a stage that is run there says it in its own way from then
-    on.
-    """
+    """Send the log to stderr within the block; a stage's command formats it in its own way."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Lines(context))
     logging.getLogger("chebsplat").setLevel("INFO")
@@ -67,9 +64,7 @@ class Guarded(click.Group):
 
 
 class NewPath(click.ParamType):
-    """A file, of one of these suffixes where there are any, or a folder: made, never written
-    over.
-    """
+    """A file (of one of these suffixes, if any) or a folder to make; it must not exist yet."""
 
     name = "path"
 
@@ -95,17 +90,17 @@ class Upward(click.ParamType):
             return value
         sign, axis = ("", value) if value[:1] not in ("+", "-") else (value[0], value[1:])
         try:
-            found = np.array([float(part) for part in value.split(",")])
+            vector = np.array([float(part) for part in value.split(",")])
         except ValueError:
-            found = np.eye(3)["xyz".index(axis)] if axis in ("x", "y", "z") else np.zeros(0)
-            found = -found if sign == "-" else found
-        length = np.linalg.norm(found)
-        if found.shape != (3,) or not 0 < length < np.inf:
+            vector = np.eye(3)["xyz".index(axis)] if axis in ("x", "y", "z") else np.zeros(0)
+            vector = -vector if sign == "-" else vector
+        length = np.linalg.norm(vector)
+        if vector.shape != (3,) or not 0 < length < np.inf:
             raise ConfigError(
                 f"--up {value}: x, y or z with a sign, three numbers such as 0,0,1, "
                 "or auto is needed"
             )
-        return found / length
+        return vector / length
 
 
 class Phrases(click.ParamType):

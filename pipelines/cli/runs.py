@@ -1,6 +1,4 @@
-"""Running and planning: scenes, sequences, studies, and the one step that is a job of
-Snakemake's.
-"""
+"""Commands that run and plan: scenes, sequences, studies, and the job that Snakemake calls."""
 
 from __future__ import annotations
 
@@ -67,12 +65,12 @@ def run(stage: str | None, cores: int | None, device: str, on: str, **choice: An
     from chebsplat.pipelines.running.run import device_of, execute
 
     where = cluster.checked(on)
-    used = device_of(device, where)
+    computing = device_of(device, where)
     cores = cores or (os.cpu_count() or 1 if where == cluster.LOCAL else 4)
     from chebsplat.pipelines.selection import checked_stage, plans
 
-    chosen = plans(**choice, running=True, device=used)
-    return execute(chosen, checked_stage(stage or None, chosen), cores, used, where)
+    scene_plans = plans(**choice, running=True, device=computing)
+    return execute(scene_plans, checked_stage(stage or None, scene_plans), cores, computing, where)
 
 
 @click.command()
@@ -83,12 +81,12 @@ def plan(device: str, **choice: Any) -> None:
     from chebsplat.pipelines.running.run import device_of
     from chebsplat.pipelines.selection import plans
 
-    chosen = plans(**choice, device=device_of(device))
-    for one in chosen:
-        print(f"{one.title}: {one.source}")
-        for step in one.steps:
+    scene_plans = plans(**choice, device=device_of(device))
+    for scene_plan in scene_plans:
+        print(f"{scene_plan.title}: {scene_plan.source}")
+        for step in scene_plan.steps:
             print(f"  {'fresh' if step.fresh else 'would run':9s} {step.stage:9s} {step.key}")
-        for what, why in one.left_out.items():
+        for what, why in scene_plan.left_out.items():
             print(f"  left out  {what}: {why}")
 
 
@@ -115,18 +113,16 @@ def study(
     device: str,
     on: str,
 ) -> int:
-    """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on
-    where it stopped.
-    """
+    """Run or resume a study (of pipelines/configs/studies, or a .toml): table, figure and page."""
     from chebsplat.pipelines.running import cluster
     from chebsplat.pipelines.running.run import Outcome, device_of, say
     from chebsplat.pipelines.studies import page, published, results, tables
     from chebsplat.pipelines.studies import study as studies
 
-    where, asked = cluster.checked(on), studies.read_study(name)
+    where, spec = cluster.checked(on), studies.read_study(name)
     computing = device_of(device, where)
     cores = cores or (os.cpu_count() or 1 if where == cluster.LOCAL else 100 * threads)
-    runs = studies.expand(asked, running=not (only_plan or no_run), device=computing)
+    runs = studies.expand(spec, running=not (only_plan or no_run), device=computing)
     say(
         f"{name}: {len(runs)} runs, {sum(run.plan.targets['evaluate'].is_dir() for run in runs)} "
         "of them done"
@@ -134,20 +130,20 @@ def study(
     if only_plan:
         print(studies.describe(studies.outstanding(runs)))
         return 0
-    used = min(threads, cores)
+    job_threads = min(threads, cores)
     folder = out or Path("build/studies") / Path(name).stem
-    command = f"make study={quote(name)} cores={cores} threads={used}"
+    command = f"make study={quote(name)} cores={cores} threads={job_threads}"
     command += f" on={quote(on)}" if where != cluster.LOCAL else ""
 
     def write(failed: dict[str, tuple[int, str, Path]]) -> Path:
         rows = [results.row_of(run, failed) for run in runs]
-        more = [*published.published_sections(asked, rows), *tables.sections(asked, rows)]
-        return page.write(folder, asked, runs, rows, command, more).absolute()
+        more = [*published.published_sections(spec, rows), *tables.sections(spec, rows)]
+        return page.write(folder, spec, runs, rows, command, more).absolute()
 
     outcome = Outcome()
     if not no_run:
         outcome = studies.execute(
-            Path(name).stem, runs, cores, used, computing, where, lambda: write({})
+            Path(name).stem, runs, cores, job_threads, computing, where, lambda: write({})
         )
     print(write(outcome.failed))
     return outcome.code
@@ -178,7 +174,7 @@ def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
 @click.command(hidden=True)
 @click.option("--semantic", is_flag=True)
 def rehearse(semantic: bool) -> int:
-    """Compile what a training needs, as long as the run lasts that this is of."""
+    """Compile the kernels of a training while the run that calls this lasts."""
     from chebsplat.pipelines.running.precompile import rehearsed
 
     os.nice(5)
@@ -187,9 +183,7 @@ def rehearse(semantic: bool) -> int:
 
 
 def _main(arguments: list[str]) -> None:
-    """Our command in a process that was forked for it; by name, since it is the command that holds
-    those of here.
-    """
+    """The command, run in a forked process; imported by name, since it imports this module."""
     import_module("chebsplat.pipelines.cli").main(arguments, prog_name="chebsplat")
 
 

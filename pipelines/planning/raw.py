@@ -1,5 +1,5 @@
-"""Raw files, which stages read outside the store: what a key holds of them, and whether they stayed
-what they were.
+"""Raw files, which stages read outside the store: their hashes, and a check that they stay the
+same.
 """
 
 from __future__ import annotations
@@ -21,14 +21,13 @@ from chebsplat.formats.images import images_below
 from chebsplat.formats.splats import splat_file
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 
-# ns; no file system's clock is coarser. What changed later than this may yet change unseen
+# ns, coarser than any file system's clock: a younger file may change without a new time stamp
 SETTLED = 2_000_000_000
-Hashes = dict[str, list[Any]]  # path -> [stamp, sha256, whether it was settled when it was read]
+Hashes = dict[str, list[Any]]  # path -> [stamp, sha256, older than SETTLED when it was read]
 
 
 def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[Path]]:
-    """The files that a stage reads with these settings, and the folder they belong to (None: only
-    names count).
+    """The files that a stage reads with these settings, and their folder (None: names alone count).
 
     Raises: InputError if there are none where there must be.
     """
@@ -76,9 +75,7 @@ def _of_teacher(settings: dict[str, Any]) -> list[Path]:
 
 
 def _of_channels(settings: dict[str, Any]) -> list[Path]:
-    """The model's files, its channel map's where it brings one, and the reference images; none of a
-    scene's.
-    """
+    """The model's files, its channel map's if any, and the reference images; none of a scene's."""
     folder = settings["reference"]
     images = images_below(Path(folder), "correct channels.reference") if folder else []
     teacher = read_teacher(Path(settings["model"]))
@@ -130,9 +127,9 @@ def content_hash(entries: Hashes, root: Path | None) -> str:
 
 @contextmanager
 def unchanged(stage: str, sections: dict[str, Any], planned: Hashes) -> Iterator[None]:
-    """A stage reads its raw files within, before and after which they are what the key says.
+    """Check before and after the block that a stage's raw files are those that its key hashes.
 
-    Raises: InputError naming the file that is another now, is new or gone.
+    Raises: InputError naming a file that has changed, is new or gone.
     """
     memo = {path: entry for path, entry in planned.items() if entry[2]}
 

@@ -1,5 +1,4 @@
-"""A run on a cluster: what its jobs ask for, which steps go there together, and that they end with
-the run.
+"""Runs on a cluster: resources of jobs, steps grouped into jobs, and jobs ended with their run.
 
 Snakemake submits a job, and on its node starts one step after the other, each in a process of its
 own as on one machine. The pipe that ends jobs with their run (processes.py) does not reach another
@@ -34,14 +33,14 @@ EXTRA = ".venv/bin/python -m uv pip install --python .venv/bin/python --editable
 
 @dataclass(frozen=True)
 class Need:
-    """What a stage asks a cluster for."""
+    """Resources that a stage requests of a cluster."""
 
     minutes: int
     mem_mb: int  # doubled at each further attempt
 
 
-# Ample: ten times the seconds that were measured at most, three times the memory, since a job that
-# asks for too little is lost, and one that asks for too much begins a little later.
+# Ten times the longest measured time and three times the memory: a job that requests too little is
+# lost, one that requests too much starts a little later.
 # measured in 18 scenes on two EPYC cores: seconds (median, most); most memory, in office0
 NEEDS = {
     "pose": Need(100, 4000),
@@ -76,7 +75,7 @@ SHORT = 60.0  # seconds of a training that is no job of its own
 
 
 def profile(on: str) -> Path:
-    """The folder of Snakemake's settings for where a run goes: one of ours, or the user's.
+    """The folder of Snakemake's settings for a run's destination: one of ours, or the user's.
 
     Raises: ConfigError where there is none.
     """
@@ -93,7 +92,7 @@ def profile(on: str) -> Path:
 
 
 def checked(on: str) -> str:
-    """`on`, if it can be had here: ConfigError says what is missing, and what adds it."""
+    """`on`, if it is usable here. Raises ConfigError naming what is missing and its remedy."""
     if on == LOCAL:
         return on
     executor = executor_of(on)
@@ -121,25 +120,23 @@ def executor_of(on: str) -> str:
 
 
 def arguments(plan: Path, on: str, cores: int, threads: int | None) -> list[str]:
-    """What Snakemake is told of a run beside its profile. Jobs at once: cores // threads, where
-    jobs have threads.
-    """
-    chosen = ["--jobs", str(max(cores // threads, 1))] if threads else []
+    """Snakemake's options beside its profile; cores // threads jobs at once, if threads are set."""
+    options = ["--jobs", str(max(cores // threads, 1))] if threads else []
     if executor_of(on) == SLURM:
-        chosen += [
+        options += [
             "--slurm-jobname-prefix",
             submitted(plan),
             "--slurm-logdir",
             str(plan.parent / "slurm"),
         ]
-    return chosen
+    return options
 
 
 def jobs_of(entries: list[dict[str, Any]], on: str) -> dict[str, dict[str, Any]]:
     """The jobs of a plan, by name: the keys of their steps in order, and what they ask for.
 
-    Choices: on one machine a step is a job. On a cluster steps of seconds go with the one that they
-      follow.
+    Choices: on one machine a step is a job. On a cluster a step of seconds joins the job of the
+      step that it follows.
     """
     jobs: dict[str, list[dict[str, Any]]] = {}
     for name, entry in zip(
@@ -165,12 +162,11 @@ def name_of(entry: dict[str, Any]) -> str:
 
 
 def together(entries: list[dict[str, Any]]) -> list[str]:
-    """For each step, in their order, the name of the job that it belongs to: that of the job's
-    first step.
+    """For each step, in order, the name of its job, which is that of the job's first step.
 
-    Choices: four kinds of jobs, and none waits for one that waits for it: what a capture begins, a
-      teacher that runs a model, a training, and what follows that. A short training goes with what
-      follows it. Other steps go alone.
+    Choices: four kinds of jobs, without cycles: capture and points, a teacher that runs a model, a
+      training, and the steps after it. A short training joins the steps after it. Other steps are
+      jobs of their own.
     """
     by_path = {entry["path"]: entry for entry in entries}
 
@@ -200,25 +196,25 @@ def together(entries: list[dict[str, Any]]) -> list[str]:
 
 
 def seconds_of(train: dict[str, Any]) -> float:
-    """How long a training takes, about."""
+    """Estimated seconds of a training."""
     settings = train["config"]["train"]
     return float(settings["seconds"] or (settings["steps"] or MOST_STEPS) * STEP_SECONDS)
 
 
 def minutes_of(entry: dict[str, Any]) -> int:
-    """The time that a step asks for."""
+    """Minutes that a step requests."""
     more = 10 * seconds_of(entry) / 60 if entry["stage"] == "train" else 0
     return NEEDS[entry["stage"]].minutes + round(more)
 
 
 def submitted(plan: Path) -> str:
-    """What the names of a run's jobs begin with in the cluster's queue."""
+    """Prefix of the names of a run's jobs in the cluster's queue."""
     return f"chebsplat-{plan.parent.name}"
 
 
 def withdraw(plan: Path, on: str) -> None:
-    """Take a run's jobs out of Slurm's queue; those that run are sent SIGTERM. Others see that the
-    run has ended.
+    """Cancel a run's jobs in Slurm's queue; running ones get SIGTERM. Other executors' jobs watch
+    the run's lease (`watch_run`).
     """
     if executor_of(on) != SLURM:
         return
@@ -236,9 +232,7 @@ def withdraw(plan: Path, on: str) -> None:
 
 
 def watch_run(plan: Path) -> None:
-    """Stop this process, a job on a node, when the run of its plan ends: it lets go of its lease,
-    or falls silent.
-    """
+    """Stop this process, a job on a node, when its run releases its lease or lets it expire."""
 
     def watch() -> None:
         goes_on = True

@@ -22,7 +22,7 @@ from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.pipelines.planning.code import PACKAGE
 from chebsplat.pipelines.planning.plan import Planner, suffix
 from chebsplat.pipelines.planning.raw import content_hash, hashes
-from chebsplat.pipelines.running.run import failures, wanted_steps
+from chebsplat.pipelines.running.run import failures, needed_steps
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import OF_KNOWLEDGE, STAGES
@@ -246,7 +246,7 @@ def test_a_training_waits_for_the_agreement_of_views_and_reads_nothing_of_it():
     assert steps["train"].after == [steps["agree"].path]
     assert steps["agree"].path not in steps["train"].inputs.values()
     plan = Planner().plan("toy")
-    assert "agree" in [step.stage for step in wanted_steps(plan, "train")]
+    assert "agree" in [step.stage for step in needed_steps(plan, "train")]
     assert Planner().plan("toy", "teacher.kind=none").targets.keys() & {"agree"} == set()
 
 

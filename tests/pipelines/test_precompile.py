@@ -100,7 +100,7 @@ if __name__ == "__main__":
                 os.kill(os.getpid(), signal.SIGKILL)
             raise KeyboardInterrupt
     except KeyboardInterrupt:
-        print(process.is_alive(), precompile.is_kept(signal.pause))
+        print(process.is_alive(), precompile.is_compiled(signal.pause))
 """
 
 

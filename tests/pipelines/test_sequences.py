@@ -8,7 +8,7 @@ from shared import ROOT
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines.planning.plan import Planner, overrides
 from chebsplat.pipelines.planning.sequences import chain, scenes_of
-from chebsplat.pipelines.running.run import wanted_steps
+from chebsplat.pipelines.running.run import needed_steps
 
 BEFORE_TRAIN = {"ingest", "sfm", "teacher", "agree"}
 LABELS = "teacher.kind=labels"
@@ -82,7 +82,7 @@ def test_scene_k_reads_the_training_of_scene_k_minus_one_and_the_first_none(sequ
         f"mine-1-toy@paper+{LABELS}",
         f"mine-2-office0@paper+{LABELS}",
     ]
-    stages = [step.stage for step in wanted_steps(found[2], "train", found)]
+    stages = [step.stage for step in needed_steps(found[2], "train", found)]
     assert (stages.count("train"), stages.count("evaluate")) == (3, 0)
 
 
