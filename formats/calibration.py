@@ -56,8 +56,7 @@ def write_calibration(path: Path, of: TeacherCalibration) -> None:
 
 
 def calibration_of(model: Path) -> TeacherCalibration | None:
-    """The calibration of a teacher's .onnx; the embedded teacher's for a copy of its file
-    elsewhere.
+    """The calibration of a teacher's .onnx, also where that is a copy of the embedded one's.
 
     Raises: as `read_calibration`.
     """

@@ -15,9 +15,7 @@ RIGID = 1e-3  # largest entry of |RRᵀ − I|
 
 @dataclass
 class Cameras(Record):
-    """names of V views; Ks f64 [V, 3, 3] pixels of a width x height image; cam_from_world [V, 4,
-    4].
-    """
+    """names of V views; Ks f64 [V, 3, 3] pixels, cam_from_world [V, 4, 4]; size of the images."""
 
     names: list[str]
     Ks: Annotated[np.ndarray, Array("float64", ("view", 3, 3), "pixels")]

@@ -79,9 +79,7 @@ class Capture(Record):
         return self.images.shape[2], self.images.shape[1]
 
     def write(self, out: Path) -> None:
-        """Fill the directory that `artifact.publish` yields. Raises InputError where views
-        disagree.
-        """
+        """Fill the directory of `artifact.publish`. Raises InputError where views disagree."""
         _check(self)
         super().write(out)
 

@@ -28,9 +28,7 @@ class Evaluation:
     pictures: dict[str, Stack] = field(default_factory=dict)
 
     def write(self, out: Path) -> None:
-        """Fill the directory that `artifact.publish` yields. Raises ValueError on a nan or
-        infinity.
-        """
+        """Fill the directory of `artifact.publish`. Raises ValueError on a nan or infinity."""
         write_document(out / FIGURES, self.figures)
         Pictures(**self.pictures).write(out)
 

@@ -1,5 +1,4 @@
-"""Files one by one: others' files read with checks of type, size and syntax, ours written
-atomically.
+"""Files: others' read with checks of type, size and syntax, ours written atomically.
 
 Every reader of such a file goes through here, so that a pipe, a device, a folder, a file of
 gigabytes, bytes that are no text and a document nested a thousand levels deep are refused at once,

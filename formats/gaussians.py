@@ -89,8 +89,7 @@ class Gaussians:
 
 @dataclass
 class Checkpoint(Record):
-    """`Gaussians` as stored: uncompressed, as random mantissas hardly shrink, without unused SH
-    bands.
+    """`Gaussians` as stored: uncompressed, as random mantissas hardly shrink, in used SH bands.
 
     modules: f32 [W], all weights one after the other, in the order of module_shapes.
     """

@@ -1,6 +1,4 @@
-"""`knowledge/2`: an encoder of shape, and the map from its features to meaning, solved from
-lessons.
-"""
+"""`knowledge/2`: an encoder of shape, and the map from its features to meaning."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""`lesson/1`: normal-equation sums over one scene's points of shape, and the evidence for their
-trust.
-"""
+"""`lesson/1`: normal-equation sums over one scene's points, and evidence for their trust."""
 
 from __future__ import annotations
 

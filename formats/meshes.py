@@ -26,9 +26,7 @@ GLTF_FLOAT, GLTF_UINT, GLTF_UBYTE, GLTF_VERTICES, GLTF_INDICES = 5126, 5125, 512
 
 
 class Mesh(NamedTuple):
-    """vertices f32 [V, 3] scene units; triangles i32 [T, 3]; colors u8 [V, 3]; labels i32 [V] or
-    None.
-    """
+    """vertices f32 [V, 3] scene units; triangles i32 [T, 3]; colors u8 [V, 3]; labels i32 [V]."""
 
     vertices: np.ndarray
     triangles: np.ndarray
@@ -37,9 +35,7 @@ class Mesh(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """depth f32 [H, W] scene units, z, 0 unknown; color u8 [H, W, 3]; K [3, 3]; pose world to
-    camera.
-    """
+    """depth f32 [H, W] scene units, 0 unknown; color u8 [H, W, 3]; K; pose world to camera."""
 
     depth: np.ndarray
     color: np.ndarray

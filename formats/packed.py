@@ -25,8 +25,7 @@ COLORS = (-1.0, 3.0)  # of SH degree 0 in training's [0, 1]; beyond it no pixel 
 
 @dataclass
 class Packed:
-    """Arrays by name; `ranges`: `low` and `step` of each quantised one, a number an axis or
-    channel.
+    """Arrays by name, and `low` and `step` of each quantised one, a number an axis or channel.
 
     means:      u8 [3, 3, N], axis and byte; `low` and `step` in the scene's frame and units.
     log_scales: u8 [3, N]; quats: u8 [4, N], of u32: the largest entry's place in the 2 upper bits,
@@ -41,8 +40,7 @@ class Packed:
 
 
 def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
-    """Quantise raw parameters (`formats.scene.Scene.parameters`). Raises ValueError on a degree
-    over 1.
+    """Quantise raw parameters (`Scene.parameters`). Raises ValueError on a degree over 1.
 
     Choices: 24 bits a coordinate, and FARTHEST, so that a stray Gaussian far off costs the others
       no visible precision; scales to about 2 %, at worst 4 %, clipped around the sizes of most;

@@ -183,8 +183,7 @@ def fused(log_scales: np.ndarray, logits: np.ndarray, size: np.ndarray) -> dict[
 def drop_unusable(
     path: Path, parameters: dict[str, np.ndarray]
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The parameters of the Gaussians that are finite, and their mask [N]; a warning counts the
-    rest.
+    """The parameters of finite Gaussians, and the mask [N] of these; a warning counts the rest.
 
     Raises:  InputError where more than MOST_UNUSABLE are not.
     Choices: an infinite logit, which converters write for 8-bit opacities of exactly 0 or 1,

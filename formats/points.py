@@ -1,6 +1,4 @@
-"""`points/2`: registered cameras, points with normals and anisotropic covariances, swept depth;
-point clouds in PLY files.
-"""
+"""`points/2`: registered cameras, points with covariances, swept depth; PLY point clouds."""
 
 from __future__ import annotations
 

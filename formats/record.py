@@ -61,8 +61,7 @@ class Record:
     COMPRESSED: ClassVar[bool] = True
 
     def write(self, out: Path) -> None:
-        """Fill the directory that `artifact.publish` yields; an array that lies in `out` already
-        stays.
+        """Fill the directory of `artifact.publish`; an array that lies in `out` already stays.
 
         Raises: ValueError naming an array of another dtype or shape, or a value that is not finite.
         """

@@ -17,9 +17,7 @@ FARTHEST = 1000.0  # extents from the origin: float32 tells 6e-5 of an extent ap
 
 @dataclass(frozen=True)
 class World:
-    """A point of the source's world is origin + scale · that of the artifacts; so are depths
-    scaled.
-    """
+    """A source's point is origin + scale · the artifacts' point; depths scale alike."""
 
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
     scale: float = 1.0

@@ -126,9 +126,7 @@ def cameras(
 @AGAINST
 @UP
 def page(scene: str, out: Path, sh: int, words: Path | None, against: list[str], up: Any) -> None:
-    """Write a finished SCENE (or a splat) as one HTML page to fly through and query, without a
-    server.
-    """
+    """Write a finished SCENE (or a splat) as one HTML page to fly through and query."""
     _write_page(scene, out, sh, words, against, up)
 
 

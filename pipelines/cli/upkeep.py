@@ -128,9 +128,7 @@ def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
 
 @click.command()
 def status() -> None:
-    """Show running, waiting and failed steps, with seconds and the end of the log, on a cluster
-    too.
-    """
+    """Show running, waiting and failed steps, with seconds and the end of the log."""
     from chebsplat.pipelines.work import store
     from chebsplat.pipelines.work.summary import lines
 

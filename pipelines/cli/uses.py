@@ -1,6 +1,4 @@
-"""Commands on a finished scene, or before one: query, mesh, extract, lift, label, check-teacher,
-get-teacher, knowledge, calibrate.
-"""
+"""Commands on a finished scene (query, mesh, extract, lift, label) and on teachers."""
 
 from __future__ import annotations
 

@@ -128,9 +128,7 @@ class Code:
 
 
 def _remembers(entry: Any, stamp: list[int]) -> bool:
-    """True where an entry of the memo, a file that may be damaged, is well formed and of this
-    stamp.
-    """
+    """True for a well-formed entry of the memo, a file that may be damaged, with this stamp."""
     if not (
         isinstance(entry, list)
         and len(entry) == 3

@@ -86,9 +86,7 @@ class PlannedLesson:
 
 @dataclass
 class Plan:
-    """Steps in order, and what is left out by reason. `title` names the folder of links:
-    scene[@quality+ablation+settings].
-    """
+    """Steps in order; left-out stages by reason; `title`: scene[@quality+ablation+settings]."""
 
     title: str
     source: str
@@ -179,9 +177,7 @@ def overrides(settings: Overrides) -> dict[str, Any]:
 
 
 def parsed(key: str, value: str) -> Any:
-    """A value as TOML reads it, or text; `on` and `off` are booleans except where `off` is a
-    choice.
-    """
+    """A value as TOML reads it, or text; `on`, `off` are booleans but where `off` is a choice."""
     if value in ("on", "off") and key in OFF_IS_CHOICE:
         return value
     try:

@@ -1,6 +1,4 @@
-"""Raw files, which stages read outside the store: their hashes, and a check that they stay the
-same.
-"""
+"""Raw files, which stages read outside the store: their hashes, and a check for changes."""
 
 from __future__ import annotations
 

@@ -213,9 +213,7 @@ def submitted(plan: Path) -> str:
 
 
 def withdraw(plan: Path, on: str) -> None:
-    """Cancel a run's jobs in Slurm's queue; running ones get SIGTERM. Other executors' jobs watch
-    the run's lease (`watch_run`).
-    """
+    """Cancel a run's jobs in Slurm's queue; others watch the run's lease (`watch_run`)."""
     if executor_of(on) != SLURM:
         return
     listed = subprocess.run(

@@ -1,6 +1,4 @@
-"""Imports preloaded by the process that compiles kernels: a fork starts 2.5 processor seconds
-ahead.
-"""
+"""Imports of the process that compiles kernels: a fork of it saves 2.5 processor seconds."""
 
 from __future__ import annotations
 

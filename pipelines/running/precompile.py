@@ -177,9 +177,7 @@ def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
 
 @contextmanager
 def beside(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
-    """A process that compiles parts, and ends with the block; forked from one with its imports
-    done.
-    """
+    """A process that compiles parts, and ends with the block; forked with its imports done."""
     context = get_context("forkserver")
     context.set_forkserver_preload(["chebsplat.pipelines.running.compiler"])
     process = context.Process(target=alone, args=(5, *parts), daemon=True)
@@ -207,9 +205,7 @@ def _end_with_parent() -> None:
 
 
 def once(part: Callable[[], None]) -> None:
-    """Compile a part unless it is cached; waits for another process at it, where files can be
-    locked.
-    """
+    """Compile a part unless it is cached; waits for another process that does, by a lock."""
     with open(_lock(part), "w") as lock:
         with suppress(OSError):
             fcntl.flock(lock, fcntl.LOCK_EX)

@@ -30,9 +30,7 @@ HERE = Path(__file__).parents[1]  # of the Snakefile
 
 @dataclass
 class Outcome:
-    """Exit code of a run (its steps' highest), and failed steps: key -> (exit code, last line,
-    log).
-    """
+    """Exit code of a run (its steps' highest); failed steps: key -> (code, last line, log)."""
 
     code: int = 0
     failed: dict[str, tuple[int, str, Path]] = field(default_factory=dict)

@@ -79,9 +79,7 @@ def _names(runs: dict[str, Run]) -> list[str]:
 def _images(
     evaluations: dict[str, Evaluation], table: np.ndarray, n: int
 ) -> tuple[list[tuple[str, str, str]], Counter[int]]:
-    """(key, URI, caption) of a scene's pictures, and pixel counts by label. table: from its labels
-    to the union's.
-    """
+    """(key, URI, caption) of pictures, and pixels by label. table: to the union's labels."""
     first = next(iter(evaluations.values()))
     view = len(first.figures["names"]) // 2
     pixels: Counter[int] = Counter()
@@ -116,9 +114,7 @@ def _small(image: np.ndarray) -> np.ndarray:
 
 
 def _modes(baseline: str, variants: list[str]) -> list[list[Any]]:
-    """Pairs that the slider compares: photo and truth with the first variant, and the baseline with
-    the photo and each variant.
-    """
+    """Pairs to compare: photo and truth with the first variant, the baseline with the others."""
 
     def of(variant: str, what: bool) -> dict[str, str | None]:
         return side(variant, f"render of {variant}", f"labels of {variant}" if what else None)

@@ -119,8 +119,7 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
 
 
 def on_one_machine(rows: list[Row]) -> tuple[list[Row], list[str]]:
-    """Rows with timings of one machine alone, that of most finished runs, and sentences on the
-    rest.
+    """Rows with timings of the machine with most finished runs, and sentences on the rest.
 
     Choices: of equally many, the first. A training that ended by the clock of another machine
       (`clock`) has other figures altogether: it has no part in the comparison, and its `state` says

@@ -156,9 +156,7 @@ def left_out(rows: list[Row]) -> list[tuple[str, str, str]]:
 
 @dataclass(frozen=True)
 class Reach:
-    """The place where a curve reaches a value: `x`, at most (`≤`) its first, or beyond (`>`) its
-    last.
-    """
+    """The place where a curve reaches a value: `x`, `≤` its first point, or `>` its last."""
 
     x: float
     bound: str = ""
@@ -212,9 +210,7 @@ def sections(study: Study, rows: list[Row]) -> list[Section]:
 
 
 def reached(end: list[Row], budgets: list[list[Row]], figure: Figure) -> list[str]:
-    """A figure of the baseline's last budget, its seconds, and another variant's seconds to reach
-    it.
-    """
+    """A figure of the baseline's last budget, its seconds, and a variant's seconds to reach it."""
     if any(row[figure.key] is None for some in (end, *budgets) for row in some):
         return ["-", "-", "-"]
 

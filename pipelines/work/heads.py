@@ -95,9 +95,7 @@ def forget(name: str, key: str) -> None:
 
 
 def usable(name: str, start: str, capture: str, scene: str) -> list[str]:
-    """Keys of a set's lessons for an encoder, of other scenes and photos, the latest of each
-    photos.
-    """
+    """Keys of a set's lessons for an encoder, of other scenes; the latest of the same photos."""
     latest: dict[str, tuple[str, str]] = {}
     for key, record in members(name).items():
         if record["start"] == start and record["capture"] != capture and record["scene"] != scene:

@@ -80,9 +80,7 @@ def _source(title: str, ingest: Manifest | None) -> str:
 
 
 def in_work(scene: str) -> Path:
-    """A scene's folder of links. Raises InputError if it is outside work, ConfigError on an
-    artifact.
-    """
+    """A scene's folder of links. Raises InputError outside work, ConfigError on an artifact."""
     folder = scene_folder(scene)
     if is_artifact(Path(os.path.expanduser(scene))):
         raise ConfigError(f"{scene} is an artifact; whole scenes are removed: name {folder.name}")

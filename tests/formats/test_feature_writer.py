@@ -144,7 +144,10 @@ def test_killed_at_random_moments_it_goes_on_and_leaves_the_same_bytes(tmp_path,
 def test_views_of_other_names_shape_or_settings_are_not_taken_over(tmp_path, other):
     written(tmp_path / "w", [0])
     assert FeatureWriter(tmp_path / "w", NAMES, SHAPE).finished == {0}
-    assert FeatureWriter(tmp_path / "w", **({"names": NAMES, "shape": SHAPE} | other)).finished == set()
+    assert (
+        FeatureWriter(tmp_path / "w", **({"names": NAMES, "shape": SHAPE} | other)).finished
+        == set()
+    )
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e6], ids=["nan", "inf", "too large"])

@@ -125,7 +125,7 @@ def constants():
 def hub(constants, tmp_path, monkeypatch):
     """A hub that answers, an empty cache, and a small photo for the check."""
     photo = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
-    monkeypatch.setattr("chebsplat.stages.tools.get_teacher.shown", lambda _: ("photo", photo))
+    monkeypatch.setattr("chebsplat.stages.tools.get_teacher.read_photo", lambda _: ("photo", photo))
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("time.sleep", lambda _: None)  # where the client waits, and tries again
     monkeypatch.chdir(tmp_path)
