@@ -84,7 +84,7 @@ def test_a_study_of_short_trainings_is_one_job_a_run():
     assert len(found) == 1 + 4
 
 
-def test_jobs_ask_for_the_most_that_a_step_needs_for_the_time_of_all_and_for_a_gpu_where_one_computes():
+def test_jobs_ask_for_the_most_memory_of_a_step_the_time_of_all_and_a_gpu_where_one_computes():
     made = cluster.jobs_of(
         entries_of(needed_steps(Planner(device="cuda").plan("office0"), None), "cuda"), "slurm"
     )

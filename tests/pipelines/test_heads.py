@@ -149,7 +149,8 @@ def test_damaged_pins_and_records_are_refused_by_name():
     a = add("a", "photos a")
     recalled("office0")
     for path, remedy in ((store.work() / "office0" / heads.PIN, "pins the scene anew"),
-                         (heads.folder("rooms") / f"{a}.json", "adds? its lesson|adds it again")):  # fmt: skip
+                         (heads.folder("rooms") / f"{a}.json",
+                          "adds? its lesson|adds it again")):  # fmt: skip
         good = path.read_text()
         for bad in ("{", "[]", '{"a": 1}'):
             path.write_text(bad)

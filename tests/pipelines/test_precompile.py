@@ -93,7 +93,9 @@ if __name__ == "__main__":
     try:
         with precompile.beside([signal.pause]) as process:
             until = time.monotonic() + 60
-            while not (lock.exists() and precompile.is_locked(signal.pause)) and time.monotonic() < until:
+            while time.monotonic() < until and not (
+                lock.exists() and precompile.is_locked(signal.pause)
+            ):
                 time.sleep(0.05)
             print(lock, process.is_alive(), flush=True)
             if sys.argv[1] == "killed":

@@ -179,8 +179,8 @@ def refined(toy, out, config=None, **changes):
 def test_labels_without_a_word_are_named_and_the_rest_of_knowledge_counts(toy, tmp_path):
     assert "knowledge" not in refined(toy, tmp_path / "a", knowledge=None)
     features = Features.read(toy["teacher"])
-    for names, what in (([*features.label_names[:-1], "thingamajig"], "votes of shape on some "
-                                                                      "labels"),
+    for names, what in (([*features.label_names[:-1], "thingamajig"],
+                         "votes of shape on some labels"),
                         ([f"thing{'amajig' * k}" for k in range(1, 1 + len(features.label_names))],
                          "knowledge of shape")):  # fmt: skip
         features.label_names = names

@@ -44,8 +44,10 @@ def capture(tmp_path_factory):
 def published_capture(path, images, labels=None, class_names=tuple(COLORS)):
     n = len(images)
     record = Capture(
-        [f"view_{k:03d}" for k in range(n)], images, np.tile(np.eye(3), (n, 1, 1)), None, np.arange(n) % 4 == 0,
-        labels=None if labels is None else labels.astype(np.int16), class_names=list(class_names) or None,
+        [f"view_{k:03d}" for k in range(n)], images, np.tile(np.eye(3), (n, 1, 1)), None,
+        np.arange(n) % 4 == 0,
+        labels=None if labels is None else labels.astype(np.int16),
+        class_names=list(class_names) or None,
     )  # fmt: skip
     return published(path, record)
 
@@ -157,7 +159,9 @@ def test_channels_are_reduced_in_every_view_and_the_labels_are_the_teacher_s(tmp
     plain.mkdir()
     _, own = encoded(plain, capture, color_teacher(plain))
     assert np.array_equal(found.pseudo_labels[:], own.pseudo_labels[:])
-    assert np.allclose(found.features[:] @ found.label_embeddings.T, own.features[:] @ own.label_embeddings.T, atol=4e-3)  # fmt: skip  # noqa: E501
+    assert np.allclose(found.features[:] @ found.label_embeddings.T,
+                       own.features[:] @ own.label_embeddings.T,
+                       atol=4e-3)  # fmt: skip
 
 
 # labels
