@@ -63,7 +63,9 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     network = TeacherInference(teacher, n_threads(), job.device)
     if job.device == "cuda" and CUDA not in providers(job.device):
-        job.left_out("the teacher on the GPU", f"onnxruntime here has no CUDA ({GPU_REMEDY})")
+        why = f"onnxruntime here has no CUDA ({GPU_REMEDY})"
+        job.left_out("the teacher on the GPU", why)
+        log.info("the teacher runs on the CPU: %s", why)
     if teacher.guessed:
         log.info(
             "%s has no `output`: logits, as %s holds names alone", teacher.settings, teacher.labels

@@ -10,7 +10,7 @@ import click
 
 from chebsplat.formats.splats import is_splat
 from chebsplat.pipelines.cli import about, knowledge, renders, runs, upkeep, uses
-from chebsplat.pipelines.cli.group import Guarded, logged, say
+from chebsplat.pipelines.cli.group import VERBOSELY, Guarded, logged, say
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.stopping import streams
 
@@ -52,7 +52,7 @@ def run_stage(name: str, job: Any) -> None:
     import_module(f"chebsplat.stages.{name}").run(job)
 
 
-@click.group(cls=Commands, params=[about.VERSION])
+@click.group(cls=Commands, params=[about.VERSION, VERBOSELY])
 def main() -> None:
     """Semantic 3D Gaussian Splatting that understands shape."""
 

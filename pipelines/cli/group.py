@@ -18,6 +18,7 @@ import numpy as np
 
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines.work import store
+from chebsplat.stages.runtime.progress import VERBOSE, log_level
 from chebsplat.stages.runtime.stopping import exit_code
 
 
@@ -25,6 +26,12 @@ def say(text: str) -> None:
     """Print a line of ours to stderr, where that is possible."""
     with suppress(OSError):  # the terminal may be gone, and the disk of a log full
         print(f"chebsplat: {text}", file=sys.stderr)
+
+
+def be_verbose(_context: click.Context, _: click.Parameter, flag: bool) -> None:
+    """Show details on the console, of this process and of those that it starts."""
+    if flag:
+        os.environ[VERBOSE] = "1"
 
 
 class _Lines(logging.Formatter):
@@ -43,7 +50,7 @@ def logged(context: click.Context) -> Iterator[None]:
     """Send the log to stderr within the block; a stage's command formats it in its own way."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Lines(context))
-    logging.getLogger("chebsplat").setLevel("INFO")
+    logging.getLogger("chebsplat").setLevel(log_level())
     logging.getLogger().addHandler(handler)
     try:
         yield
@@ -112,6 +119,14 @@ class Phrases(click.ParamType):
         return [word.strip() for word in value.split(",") if word.strip()]
 
 
+VERBOSELY = click.Option(
+    ["-v", "--verbose"],
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=be_verbose,
+    help="Say what a scene leaves out, and other details.",
+)
 UP = click.option(
     "--up",
     type=Upward(),

@@ -29,12 +29,11 @@ LIFTED = "train.features is lifted"
 # kinds that hold photos of any place
 PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes", "video")
 POSELESS = ("photos", "video")  # kinds that bring no poses
-UNASKED = "no teacher is named"
+UNASKED = "no 2D teacher is named"
 HOW = (
-    "the embedded one has seen generated rooms only. `chebsplat get-teacher segformer-b0-ade` "
-    "fetches one for photos "
-    "(docs/teachers.md), set=teacher.model=MODEL.onnx names it; teacher.kind=embedded uses the "
-    "embedded one even so"
+    "to label photographs, fetch one with `chebsplat get-teacher segformer-b0-ade` and name it with "
+    "set=teacher.model=MODEL.onnx (docs/teachers.md); the embedded one (set=teacher.kind=embedded) "
+    "was trained on generated rooms only"
 )
 
 
@@ -84,7 +83,7 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
             f"train.method is printed, which needs a teacher, and {why}; name one with teacher.kind"
         )
     if kind == "none":
-        left_out |= {"teacher": f"{why}: {HOW}" if why == UNASKED else why}
+        left_out |= {"teacher": f"{why}; {HOW}" if why == UNASKED else why}
         left_out |= {"lift": f"no teacher's features to lift ({why})"}
         left_out |= {
             "refine": f"no semantic features to refine ({why})",

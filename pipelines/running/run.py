@@ -24,6 +24,7 @@ from chebsplat.pipelines.work.store import say
 from chebsplat.pipelines.work.summary import aligned
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.device import resolve
+from chebsplat.stages.runtime.progress import is_verbose
 
 HERE = Path(__file__).parents[1]  # of the Snakefile
 
@@ -56,8 +57,11 @@ def execute(
     stale = [step for step in steps.values() if not step.fresh]
     for plan in plans:
         say(f"{plan.title}: {plan.source}")
-        for what, why in plan.left_out.items():
-            say(f"  left out: {what} ({why})")
+        if is_verbose():
+            for what, why in plan.left_out.items():
+                say(f"  left out: {what} ({why})")
+        elif "teacher" in plan.left_out:
+            say(f"  colour only, without labels: {plan.left_out['teacher']}")
     code = 0
     try:
         if stale:

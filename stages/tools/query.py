@@ -179,7 +179,7 @@ def embedded(words: list[str], features: Features, model: str | None) -> np.ndar
     if features.channels is not None:
         vectors = features.channels.embed(vectors)
         share = float(np.linalg.norm(vectors[0]))
-        log.info("%.0f %% of the query's length lies in the scene's channels", 100 * share)
+        log.debug("the scene's channels keep %.0f %% of the query's embedding", 100 * share)
     return vectors
 
 
