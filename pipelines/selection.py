@@ -31,7 +31,7 @@ def plans(
     planner = Planner(running=running, device=device, newer=newer, quality=quality)
     try:
         if sequence is not None:
-            return sequences.chain(planner, sequence, settings, ablation)
+            return sequences.plan_sequence(planner, sequence, settings, ablation)
         return [planner.plan(str(scene), settings, ablation)]
     finally:
         planner.save()

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.stability.case import Outcome, beside, case
 from chebsplat.formats.meshes import Frame, Mesh, fused
-from chebsplat.stages.tools.mesh import away, without_edges
+from chebsplat.stages.tools.mesh import away, drop_edges
 from chebsplat.synthetic.rays import open3d
 
 HEIGHT, WIDTH, VOXEL, WALL = 30, 40, 0.05, 2.0
@@ -118,7 +118,7 @@ def edges(unit: float, hole: float) -> Outcome:
         far = np.abs(np.diff(given, axis=1, append=given[:, -1:])) > 0.1
         return np.where(far | np.roll(far, 1, 1), 0, given) / np.float32(unit)
 
-    return beside(without_edges(given) / np.float32(unit), plainly, exact, 1e-6)
+    return beside(drop_edges(given) / np.float32(unit), plainly, exact, 1e-6)
 
 
 def ball(n: int = 40) -> Mesh:

@@ -79,12 +79,12 @@ def forget(lesson: str, name: str) -> None:
 def rebuild(name: str, cores: int) -> int:
     """Learn every lesson of a set again by the encoder that ships now, from stored artifacts."""
     from chebsplat.pipelines.planning.plan import Planner
-    from chebsplat.pipelines.planning.sequences import relearning
+    from chebsplat.pipelines.planning.sequences import plan_relearning
     from chebsplat.pipelines.running.run import execute
 
     planner = Planner(running=True)
     try:
-        lesson_plans = relearning(planner, name)
+        lesson_plans = plan_relearning(planner, name)
     finally:
         planner.save()
     return execute(lesson_plans, "learn", cores) if lesson_plans else 0
@@ -101,14 +101,14 @@ def teach(teacher: Path | None, settings: str, out: Path | None, cores: int) -> 
     """Train an encoder of shape for a TEACHER on generated rooms; its scenes start from it."""
     from chebsplat.formats import artifact
     from chebsplat.pipelines.planning.plan import Planner
-    from chebsplat.pipelines.planning.sequences import teaching
+    from chebsplat.pipelines.planning.sequences import plan_teaching
     from chebsplat.pipelines.running.run import execute
     from chebsplat.pipelines.work import store
 
     planner = Planner(running=True)
     try:
         store.make_work()
-        plan = teaching(planner, teacher, settings)
+        plan = plan_teaching(planner, teacher, settings)
     finally:
         planner.save()
     code = execute([plan], "teach", cores)

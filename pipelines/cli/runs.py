@@ -159,11 +159,11 @@ def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
     """Steps of a plan, one after the other until one fails, as Snakemake runs them."""
     from chebsplat.pipelines.running import job as jobs
     from chebsplat.pipelines.running.cluster import watch_run
-    from chebsplat.pipelines.running.processes import in_turn
+    from chebsplat.pipelines.running.processes import run_in_turn
 
     jobs.use_threads()
     if len(keys) > 1:
-        return in_turn(
+        return run_in_turn(
             _main, [["job", *["--elsewhere"] * elsewhere, str(plan), key] for key in keys]
         )
     if elsewhere:
@@ -175,10 +175,10 @@ def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
 @click.option("--semantic", is_flag=True)
 def rehearse(semantic: bool) -> int:
     """Compile the kernels of a training while the run that calls this lasts."""
-    from chebsplat.pipelines.running.precompile import rehearsed
+    from chebsplat.pipelines.running.precompile import precompile
 
     os.nice(5)
-    with rehearsed(2, semantic):
+    with precompile(2, semantic):
         return 0
 
 

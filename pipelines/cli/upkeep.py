@@ -51,7 +51,7 @@ def rm(scenes: tuple[str, ...], yes: bool) -> None:
     from chebsplat.pipelines.work import inventory
 
     folders = list(dict.fromkeys(inventory.in_work(scene) for scene in scenes))
-    artifacts = inventory.only_of(folders)
+    artifacts = inventory.list_exclusive(folders)
     for folder in folders:
         foreign = inventory.others(folder)
         print(
@@ -113,8 +113,8 @@ def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
     """List the artifacts that no scene names any more, and leftovers of killed runs."""
     from chebsplat.pipelines.work import inventory, store
 
-    old = [] if older_than is None else inventory.untouched(older_than)
-    leftovers = store.unnamed(set(old))
+    old = [] if older_than is None else inventory.list_idle(older_than)
+    leftovers = store.list_unreferenced(set(old))
     leftovers = [
         (path, size) for path, size in leftovers if not keep_newer or store.age(path) >= keep_newer
     ]

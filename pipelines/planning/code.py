@@ -178,7 +178,7 @@ def step_key(
     identity = {
         "stage": stage.name,
         "schema": stage.schema,
-        "config": placeless(sections),
+        "config": without_paths(sections),
         "inputs": inputs,
         "code": code,
     } | ({} if raw is None else {"raw": raw})
@@ -188,7 +188,7 @@ def step_key(
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def placeless(sections: dict[str, Any]) -> dict[str, Any]:
+def without_paths(sections: dict[str, Any]) -> dict[str, Any]:
     """Sections that name raw files by their last part only."""
     named = {name: dict(section) for name, section in sections.items()}
     for section, key in PLACES:

@@ -21,7 +21,7 @@ from chebsplat.formats.teacher_model import (
 )
 from chebsplat.formats.videos import is_video, require_av
 from chebsplat.pipelines.work import store
-from chebsplat.pipelines.work.scenes import expanded
+from chebsplat.pipelines.work.scenes import expand_variables
 from chebsplat.stages.sources.common import unread
 from chebsplat.stages.teacher_models.text_encoder import found
 
@@ -210,9 +210,11 @@ def choose_start(config: Any, kind: str, running: bool) -> Start:
     if start == "none":
         return Start(why="knowledge.start is none")
     if "/" in start:
-        folder = Path(expanded(start)).expanduser().resolve()
+        folder = Path(expand_variables(start)).expanduser().resolve()
         return Start(
-            store.taken_in(folder, "teach", SCHEMA, running), None, "knowledge.start is a folder"
+            store.import_artifact(folder, "teach", SCHEMA, running),
+            None,
+            "knowledge.start is a folder",
         )
     model = read_teacher(Path(config.teacher.model or EMBEDDED)) if kind == "onnx" else None
     if (
@@ -223,7 +225,7 @@ def choose_start(config: Any, kind: str, running: bool) -> Start:
         return Start(
             why=f"none was taught for the teacher {model.name}; `chebsplat knowledge teach` does"
         )
-    path = store.taken_in(SHIPPED, "teach", SCHEMA, running)
+    path = store.import_artifact(SHIPPED, "teach", SCHEMA, running)
     if start == "shipped":
         return Start(path, None, "knowledge.start is shipped")
     return Start(path, start)

@@ -31,11 +31,11 @@ from chebsplat.pipelines.planning.needs import (
 from chebsplat.pipelines.planning.raw import Hashes, content_hash, hashes, raw_files
 from chebsplat.pipelines.work import folders, heads, store
 from chebsplat.pipelines.work.scenes import (
-    absent,
     escape_text,
-    expanded,
+    expand_variables,
     folder_of,
     is_source,
+    missing_source,
     read_toml,
     scene_values,
 )
@@ -112,7 +112,7 @@ def resolve_paths(config: Config) -> Config:
         values = getattr(config, section)
         path = getattr(values, key)
         if path is not None:
-            absolute = os.path.realpath(os.path.expanduser(expanded(path)))
+            absolute = os.path.realpath(os.path.expanduser(expand_variables(path)))
             config = config.model_copy(update={section: values.model_copy(update={key: absolute})})
     return config
 
@@ -363,6 +363,6 @@ class Planner:
             return {"poses": True, "depth": True, "labels": True}
         folder = Path(source.path)
         if not is_source(folder):
-            raise absent(scene, folder)
+            raise missing_source(scene, folder)
         module = import_module(f"chebsplat.stages.sources.{source.kind}")
         return module.probe(folder)  # type: ignore[no-any-return]

@@ -46,7 +46,9 @@ def scenes_of(name: str) -> list[str]:
     return scenes
 
 
-def chain(planner: Planner, name: str, settings: Overrides = "", ablation: str = "") -> list[Plan]:
+def plan_sequence(
+    planner: Planner, name: str, settings: Overrides = "", ablation: str = ""
+) -> list[Plan]:
     """Plans of a sequence's scenes, each with the lessons of those before it, or in the printed
     method with the bases of the training before it.
     """
@@ -63,7 +65,7 @@ def chain(planner: Planner, name: str, settings: Overrides = "", ablation: str =
     return plans
 
 
-def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
+def plan_teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
     """The steps that train an encoder of shape for a teacher, by default the embedded one.
 
     Raises: ConfigError on a closed-set teacher, whose classes no shape is taught.
@@ -89,12 +91,12 @@ def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
     )
 
 
-def relearning(planner: Planner, name: str) -> list[Plan]:
+def plan_relearning(planner: Planner, name: str) -> list[Plan]:
     """The steps that learn the lessons of a set again by the encoder that ships now, from stored
     artifacts. Lessons by that encoder, and of scenes whose artifacts are gone, stay as they are.
     """
     plans: list[Plan] = []
-    start = store.taken_in(SHIPPED, "teach", SCHEMA, planner.running)
+    start = store.import_artifact(SHIPPED, "teach", SCHEMA, planner.running)
     for key, record in heads.members(name).items():
         manifest = artifact.read_manifest(heads.folder(name) / key)
         inputs = {

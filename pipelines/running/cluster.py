@@ -125,7 +125,7 @@ def arguments(plan: Path, on: str, cores: int, threads: int | None) -> list[str]
     if executor_of(on) == SLURM:
         options += [
             "--slurm-jobname-prefix",
-            submitted(plan),
+            job_prefix(plan),
             "--slurm-logdir",
             str(plan.parent / "slurm"),
         ]
@@ -140,7 +140,7 @@ def jobs_of(entries: list[dict[str, Any]], on: str) -> dict[str, dict[str, Any]]
     """
     jobs: dict[str, list[dict[str, Any]]] = {}
     for name, entry in zip(
-        together(entries) if on != LOCAL else map(name_of, entries), entries, strict=True
+        job_names(entries) if on != LOCAL else map(name_of, entries), entries, strict=True
     ):
         jobs.setdefault(name, []).append(entry)
     return {
@@ -161,7 +161,7 @@ def name_of(entry: dict[str, Any]) -> str:
     return f"{entry['stage']}-{entry['key']}"
 
 
-def together(entries: list[dict[str, Any]]) -> list[str]:
+def job_names(entries: list[dict[str, Any]]) -> list[str]:
     """For each step, in order, the name of its job, which is that of the job's first step.
 
     Choices: four kinds of jobs, without cycles: capture and points, a teacher that runs a model, a
@@ -207,24 +207,26 @@ def minutes_of(entry: dict[str, Any]) -> int:
     return NEEDS[entry["stage"]].minutes + round(more)
 
 
-def submitted(plan: Path) -> str:
+def job_prefix(plan: Path) -> str:
     """Prefix of the names of a run's jobs in the cluster's queue."""
     return f"chebsplat-{plan.parent.name}"
 
 
-def withdraw(plan: Path, on: str) -> None:
+def cancel_jobs(plan: Path, on: str) -> None:
     """Cancel a run's jobs in Slurm's queue; others watch the run's lease (`watch_run`)."""
     if executor_of(on) != SLURM:
         return
     listed = subprocess.run(
         ["squeue", "--me", "--noheader", "--format=%i %j"], capture_output=True, text=True
     )
-    ours = [line.split()[0] for line in listed.stdout.splitlines() if f" {submitted(plan)}" in line]
+    ours = [
+        line.split()[0] for line in listed.stdout.splitlines() if f" {job_prefix(plan)}" in line
+    ]
     if listed.returncode or (
         ours and subprocess.run(["scancel", *ours], capture_output=True).returncode
     ):
         say(
-            f"jobs could not be taken out of the queue; those called {submitted(plan)}... end by "
+            f"jobs could not be taken out of the queue; those called {job_prefix(plan)}... end by "
             "themselves"
         )
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.pipelines.planning.raw import unchanged
-from chebsplat.pipelines.running.precompile import rehearsed
+from chebsplat.pipelines.running.precompile import precompile
 from chebsplat.pipelines.work import leases, store
 from chebsplat.pipelines.work.store import say
 from chebsplat.stages.runtime.command import Planned, n_threads, publish
@@ -76,17 +76,17 @@ def make(plan: Path, key: str) -> None:
         store.remove_half(out)
         config, hashes = Path(f"{files}.json"), json.loads(Path(f"{files}.raw.json").read_text())
         module = import_module(f"chebsplat.stages.{stage}")
-        planned = Planned(key, step["code"], prepared(step, hashes))
+        planned = Planned(key, step["code"], prepare_stage(step, hashes))
         publish(stage, module.run, out, inputs, config, planned=planned, device=step["device"])
 
 
 @contextmanager
-def prepared(step: dict[str, Any], hashes: dict[str, Any]) -> Iterator[None]:
+def prepare_stage(step: dict[str, Any], hashes: dict[str, Any]) -> Iterator[None]:
     """Check raw files before and after a stage, and compile a CPU training's kernels before it."""
     with ExitStack() as stack:
         stack.enter_context(unchanged(step["stage"], step["config"], hashes))
         if step["stage"] == "train" and step["device"] != "cuda":
-            stack.enter_context(rehearsed(n_threads(), "features" in step["inputs"]))
+            stack.enter_context(precompile(n_threads(), "features" in step["inputs"]))
         yield
 
 

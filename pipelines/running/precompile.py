@@ -146,7 +146,7 @@ SIDE_BY_SIDE = (rasterizer, lifting), (adjoints,), (losses, colors)
 
 
 @contextmanager
-def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
+def precompile(n_threads: int, semantic: bool) -> Iterator[None]:
     """Compile a training's kernels before the block, and those of later stages during it.
 
     Choices: nothing is done where all are cached or no cache can be written, or with one thread.
@@ -165,22 +165,22 @@ def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
     with ExitStack() as processes:
         if not any(is_locked(part) for part in before):
             chains = [[part for part in chain if part in before] for chain in SIDE_BY_SIDE]
-            for process in [processes.enter_context(beside(chain)) for chain in chains]:
+            for process in [processes.enter_context(compiler_process(chain)) for chain in chains]:
                 process.join()
         for part in before:
-            once(part)
-        followers = [processes.enter_context(beside([part])) for part in behind]
+            compile_once(part)
+        followers = [processes.enter_context(compiler_process([part])) for part in behind]
         yield
         for process in followers:
             process.join()
 
 
 @contextmanager
-def beside(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
+def compiler_process(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
     """A process that compiles parts, and ends with the block; forked with its imports done."""
     context = get_context("forkserver")
     context.set_forkserver_preload(["chebsplat.pipelines.running.compiler"])
-    process = context.Process(target=alone, args=(5, *parts), daemon=True)
+    process = context.Process(target=compile_parts, args=(5, *parts), daemon=True)
     process.start()
     try:
         yield process
@@ -189,12 +189,12 @@ def beside(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
         process.join()
 
 
-def alone(niceness: int, *parts: Callable[[], None]) -> None:
+def compile_parts(niceness: int, *parts: Callable[[], None]) -> None:
     """Compile parts in a low-priority process, which ends with its parent."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.nice(niceness)
     for part in parts:
-        once(part)
+        compile_once(part)
 
 
 def _end_with_parent() -> None:
@@ -204,7 +204,7 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def once(part: Callable[[], None]) -> None:
+def compile_once(part: Callable[[], None]) -> None:
     """Compile a part unless it is cached; waits for another process that does, by a lock."""
     with open(_lock(part), "w") as lock:
         with suppress(OSError):

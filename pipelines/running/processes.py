@@ -67,7 +67,7 @@ def snakemake(
             start_new_session=True,
         )
         try:
-            with paused_together(process):
+            with pause_together(process):
                 while process.poll() is None:  # a signal that another thread takes wakes no `wait`
                     time.sleep(0.02)
             return process.returncode
@@ -77,7 +77,7 @@ def snakemake(
 
 
 @contextmanager
-def paused_together(process: subprocess.Popen[bytes]) -> Iterator[None]:
+def pause_together(process: subprocess.Popen[bytes]) -> Iterator[None]:
     """Pass a terminal's Ctrl-Z, which reaches this process alone, to the session of `process`."""
 
     def pause(_number: int, _frame: FrameType | None) -> None:
@@ -106,7 +106,7 @@ def end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def in_turn(command: Callable[[list[str]], None], calls: list[list[str]]) -> int:
+def run_in_turn(command: Callable[[list[str]], None], calls: list[list[str]]) -> int:
     """Call a command of ours for each list of arguments until one fails; returns its exit code.
 
     Each call has a process of its own, forked from one that has imported the common packages and

@@ -162,7 +162,7 @@ def snakemake(
             return failures(steps, folder, words) if code else Outcome()
         finally:
             if code != 0 and on != cluster.LOCAL:
-                cluster.withdraw(plan, on)
+                cluster.cancel_jobs(plan, on)
             elif code != 0:
                 store.remove_halves([step.path for step in steps])
             if not code:

@@ -16,7 +16,7 @@ MARKERS = "osD^vP*X<>"
 Traces = list[tuple[Row, list[dict[str, float]]]]
 
 
-def drawn(name: str) -> str:
+def escape_name(name: str) -> str:
     """A name escaped for matplotlib: no mathematics, and never hidden from the legend."""
     return (" " if name.startswith("_") else "") + name.replace("$", r"\$")
 
@@ -34,7 +34,11 @@ def draw(
     finished = [row for row in rows if row["state"] == "done"]
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     style = {
-        name: {"color": f"C{k % 10}", "marker": MARKERS[k % len(MARKERS)], "label": drawn(name)}
+        name: {
+            "color": f"C{k % 10}",
+            "marker": MARKERS[k % len(MARKERS)],
+            "label": escape_name(name),
+        }
         for k, name in enumerate(variants)
     }
     conditions = (
@@ -59,10 +63,10 @@ def draw(
         elif color_only:
             for axis, scene in zip(line, scenes, strict=True):
                 _of_scene(axis, scene, members, followed, style)
-            line[0].set_ylabel(f"PSNR, dB {drawn(condition)}".strip())
+            line[0].set_ylabel(f"PSNR, dB {escape_name(condition)}".strip())
         else:
             _over_time(line, members, followed, style)
-            line[0].set_ylabel(drawn(condition))
+            line[0].set_ylabel(escape_name(condition))
         for axis in line:
             axis.grid(alpha=0.3)
     handles = {
@@ -115,7 +119,7 @@ def _of_scene(
     _longest(axis, [(row, trace) for row, trace in traces if row["scene"] == scene], style)
     axis.set_xscale("log")
     axis.xaxis.set_major_formatter("{x:g}")
-    axis.set_title(drawn(scene), fontsize=10)
+    axis.set_title(escape_name(scene), fontsize=10)
     axis.set_xlabel("training seconds (thin: views trained on)", fontsize=9)
 
 

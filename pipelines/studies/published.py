@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from chebsplat.evaluation import protocols
 from chebsplat.pipelines.studies.results import FIGURES, Figure, Line, Row, compare
-from chebsplat.pipelines.studies.study import Study, lacking
+from chebsplat.pipelines.studies.study import Study, list_missing
 from chebsplat.pipelines.studies.tables import Section, mean_text
 from chebsplat.stages.runtime.config import build
 
@@ -32,7 +32,7 @@ def published_sections(study: Study, rows: list[Row]) -> list[Section]:
             *(("", name) for name, of in table.variants.items() if not of),
         ]:
             line = lines.get((condition, variant))
-            reasons = lacking(study, condition, variant) if variant else {}
+            reasons = list_missing(study, condition, variant) if variant else {}
             cells = [row or "-", variant or "-", f"{line.n_done} of {line.n_runs}" if line else "-"]
             for figure in columns:
                 cells += _cells(table.published.get(row, {}), line, figure)

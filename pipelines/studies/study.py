@@ -98,7 +98,7 @@ class Table(Section):
 
 
 class Study(Section):
-    """A file of `configs/studies`, alone or over another that it `extends` (`extended`).
+    """A file of `configs/studies`, alone or over another that it `extends` (`extend_study`).
     `settings`, conditions and variants hold config sections.
 
     Conditions are what results are averaged within (a teacher, a noise level); variants are
@@ -196,10 +196,10 @@ def read_study(name: str) -> Study:
 
 def checked_study(values: dict[str, Any], origin: str) -> Study:
     """The study that a .toml's values describe. Raises ConfigError naming `origin` and the key."""
-    return checked(Study, extended(values, origin) if "extends" in values else values, origin)
+    return checked(Study, extend_study(values, origin) if "extends" in values else values, origin)
 
 
-def extended(values: dict[str, Any], origin: str) -> dict[str, Any]:
+def extend_study(values: dict[str, Any], origin: str) -> dict[str, Any]:
     """A study's values over those of the study of ours that it `extends`, which extends none.
 
     Its `variants` and `conditions` may be lists, of names of the other's.
@@ -223,7 +223,7 @@ def extended(values: dict[str, Any], origin: str) -> dict[str, Any]:
 def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run]:
     """Every run, planned; variants vary fastest, so that a study cut short has full comparisons.
 
-    Args: running, device: of `Planner`. A missing scene of a table has no run (`lacking`).
+    Args: running, device: of `Planner`. A missing scene of a table has no run (`list_missing`).
     Raises: ConfigError, InputError.
     Choices: all runs of a condition are measured under one protocol, since figures of two do not
       average.
@@ -250,7 +250,7 @@ def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run
                     ]
                     knowledge = {"start": "shipped"} | scene_values(scene)[1].get("knowledge", {})
                     values = merged(
-                        {"knowledge": knowledge}, merged(values, seeded(scene, values, seed))
+                        {"knowledge": knowledge}, merged(values, seed_settings(scene, values, seed))
                     )
                     place = suffix(f"study-{variant}-seed{seed}-") if study.grows else ""
                     plan = planner.plan(scene, values=values, place=place, lessons=lessons)
@@ -269,7 +269,7 @@ def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run
     return runs
 
 
-def lacking(study: Study, condition: str, variant: str) -> dict[str, list[str]]:
+def list_missing(study: Study, condition: str, variant: str) -> dict[str, list[str]]:
     """Scenes of a table that a variant cannot run on, by why it cannot."""
     table, reasons = study.tables[condition], defaultdict(list)
     semantic = is_semantic(_values(study, condition, variant))
@@ -291,7 +291,7 @@ def _values(study: Study, condition: str, variant: str) -> Sections:
     return merged(merged(values, read_toml("ablations", ablation) if ablation else {}), own)
 
 
-def seeded(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
+def seed_settings(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
     """A seed's settings: of training, and of a label teacher's noise; other teachers run once."""
     kind = merged(scene_values(scene)[1], values).get("teacher", {}).get("kind")
     return {"train": {"seed": seed}} | ({"teacher": {"seed": seed}} if kind == "labels" else {})
@@ -326,7 +326,7 @@ def execute(
         parts.setdefault(title, []).append(run)
     links = {run.name: run.plan.targets[LAST] for run in runs}
     at_once = f"{cores // threads} at once, {threads} threads each"
-    with reported(runs, say, refresh):
+    with report_progress(runs, say, refresh):
         for title, part in parts.items():
             if waiting := outstanding(part):
                 try:
@@ -352,7 +352,7 @@ def describe(steps: list[Step]) -> str:
 
 
 @contextmanager
-def reported(
+def report_progress(
     runs: Sequence[Run], say: Callable[[str], None], refresh: Callable[[], object] = lambda: None
 ) -> Iterator[None]:
     """Report `n of m done` as runs finish during the block, and call `refresh` now and then."""

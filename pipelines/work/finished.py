@@ -65,7 +65,7 @@ def scene_folder(scene: str) -> Path:
         raise ConfigError(
             f"{escape_text(scene)} was run with different settings: name one of {', '.join(runs)}"
         )
-    raise unknown(scene)
+    raise unknown_scene(scene)
 
 
 def holder(artifact: Path) -> Path | None:
@@ -83,7 +83,7 @@ def holder(artifact: Path) -> Path | None:
     return None
 
 
-def unknown(scene: str) -> ConfigError | InputError:
+def unknown_scene(scene: str) -> ConfigError | InputError:
     """The error for a scene that is not there, with the nearest names."""
     where, run = (
         f"no finished scene in {store.work()}",

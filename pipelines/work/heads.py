@@ -143,4 +143,4 @@ def fetch(title: str, name: str, key: str, running: bool) -> Path:
             f"{title} is pinned to the lesson {key}, which {name} has no more; add "
             "newer=1 (--newer)"
         )
-    return store.taken_in(folder(name) / key, "learn", lesson.SCHEMA, running)
+    return store.import_artifact(folder(name) / key, "learn", lesson.SCHEMA, running)

@@ -89,13 +89,17 @@ def in_work(scene: str) -> Path:
     return store.work() / folder.name
 
 
-def only_of(scene_folders: list[Path]) -> list[tuple[Path, int]]:
+def list_exclusive(scene_folders: list[Path]) -> list[tuple[Path, int]]:
     """Artifacts, with bytes, that nothing would name without the links in `chosen`."""
-    before = {path for path, _ in store.unnamed()}
-    return [(path, size) for path, size in store.unnamed(set(scene_folders)) if path not in before]
+    before = {path for path, _ in store.list_unreferenced()}
+    return [
+        (path, size)
+        for path, size in store.list_unreferenced(set(scene_folders))
+        if path not in before
+    ]
 
 
-def untouched(age: float) -> list[Path]:
+def list_idle(age: float) -> list[Path]:
     """Folders of scenes and studies whose artifacts are all older than so many seconds."""
     link_paths = {title: links(store.work() / title) for title in titles()}
     ours = {

@@ -58,7 +58,7 @@ def escape_text(text: str) -> str:
     return text if text.isprintable() and 0 < len(text) <= 200 else f"{text[:80]!a}"
 
 
-def expanded(text: str) -> str:
+def expand_variables(text: str) -> str:
     """`${NAME:-default}` by the environment."""
     return VARIABLE.sub(lambda match: os.environ.get(match[1]) or match[2], text)
 
@@ -121,11 +121,11 @@ def data_of(scene: str) -> tuple[str, Path] | None:
         else ""
     )
     if match := VARIABLE.match(path):
-        return match[1], Path(os.path.realpath(os.path.expanduser(expanded(path))))
+        return match[1], Path(os.path.realpath(os.path.expanduser(expand_variables(path))))
     return None
 
 
-def absent(scene: str, folder: Path) -> InputError:
+def missing_source(scene: str, folder: Path) -> InputError:
     """The error for a missing source, with its remedy."""
     needed = data_of(scene)
     if needed is None or needed[1] != folder:

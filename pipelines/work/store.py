@@ -120,7 +120,7 @@ def link(scene: str, targets: dict[str, Path]) -> Path:
     return folder
 
 
-def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
+def list_unreferenced(without: Container[Path] = ()) -> list[tuple[Path, int]]:
     """Artifacts that no link and no running plan reaches, neither directly nor as an input, and
     leftovers of runs that failed or were killed; with bytes. Raises InputError if a manifest is
     damaged.
@@ -251,7 +251,7 @@ def _owner_lives(path: Path) -> bool:
 
 
 def remove(path: Path) -> None:
-    """Remove a path that `unnamed` listed; of a link, the link alone."""
+    """Remove a path that `list_unreferenced` listed; of a link, the link alone."""
     if path.is_symlink() or not path.is_dir():
         path.unlink(missing_ok=True)
         return
@@ -259,7 +259,7 @@ def remove(path: Path) -> None:
     shutil.rmtree(path, ignore_errors=True)
 
 
-def taken_in(folder: Path, stage: str, schema: str, running: bool) -> Path:
+def import_artifact(folder: Path, stage: str, schema: str, running: bool) -> Path:
     """Path in the store of a stage's artifact from elsewhere; verified, and copied there to run.
 
     Raises: InputError on a damaged artifact, or one of another schema.

@@ -74,7 +74,7 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
             as_taken(measured),
         ),
         ("mIoU", miou, "; ".join(filter(None, beside))),
-        *((what, str(len(names)), few(names)) for what, names in strangers(segmentation)),
+        *((what, str(len(names)), few(names)) for what, names in unmatched_names(segmentation)),
         ("Gaussians", text("{:,}", number(measured, "n_gaussians")), ""),
         ("PLY", size["ply"], others),
         (
@@ -94,7 +94,7 @@ def as_taken(figures: Any) -> str:
     )
 
 
-def strangers(segmentation: Any) -> list[tuple[str, list[str]]]:
+def unmatched_names(segmentation: Any) -> list[tuple[str, list[str]]]:
     """Classes of the truth, and labels of the scene, without a counterpart in the other."""
     words = {"truth": "true classes without a label", "scene": "labels that are no class"}
     unmatched = segmentation.get("unmatched", {})

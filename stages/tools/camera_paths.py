@@ -75,7 +75,7 @@ def orbit(cameras: list[Camera], n_frames: int, up: np.ndarray | None = None) ->
     round_ = np.stack([radii[0] * np.cos(angles), radii[1] * np.sin(angles)], 1) @ axes.T
     places = middle + round_ @ turn[:2]
     return [
-        replace(cameras[0], name=f"orbit_{k:04d}", cam_from_world=looking(place, target, turn[2]))
+        replace(cameras[0], name=f"orbit_{k:04d}", cam_from_world=look_at(place, target, turn[2]))
         for k, place in enumerate(places)
     ]
 
@@ -116,7 +116,7 @@ def focus(eyes: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     return np.linalg.solve(total, np.einsum("vij,vj->i", across, eyes))
 
 
-def looking(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """cam_from_world [4, 4], OpenCV's axes, of an upright camera at `eye` towards `target`."""
     forward = target - eye
     forward /= np.linalg.norm(forward)

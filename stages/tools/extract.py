@@ -10,7 +10,7 @@ from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.formats.scene import Scene
 from chebsplat.splats.parts import substantial
 from chebsplat.stages.tools.query import Query
-from chebsplat.stages.tools.scene import OpenedScene, passing
+from chebsplat.stages.tools.scene import OpenedScene, filter_masks
 
 # or scene.spz --spz-version 3
 CONVERT = "npx @playcanvas/splat-transform@2.7.1 scene.ply scene.compressed.ply"
@@ -38,7 +38,7 @@ def extract(
         raise ConfigError(
             f"{out}: only a plain .ply is written; convert that, for instance: {CONVERT}"
         )
-    filters = passing(scene.exported, scene.source, labels, min_opacity, box)
+    filters = filter_masks(scene.exported, scene.source, labels, min_opacity, box)
     if query is not None:
         filters["query"] = select_by_query(scene.exported, query)
     n = len(scene)

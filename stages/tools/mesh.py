@@ -48,7 +48,9 @@ def mesh_of(
     edge = extent / N_VOXELS if voxel is None else voxel / scene.world.scale
     size = f"{edge * scene.world.scale:.3g}"
     depth_points: list[np.ndarray] = []
-    surface = fused(open3d(), noted(frames(scene, progress), depth_points), edge, 2 * extent)
+    surface = fused(
+        open3d(), collect_points(frames(scene, progress), depth_points), edge, 2 * extent
+    )
     if not len(surface.triangles):
         raise DataFailure(
             f"{scene.source} shows no surface of voxels of {size}; choose larger ones: --voxel"
@@ -85,7 +87,7 @@ def away(mesh: Mesh, points: np.ndarray) -> float:
     return float(np.median(caster.compute_distance(core.Tensor(points.astype(np.float32))).numpy()))
 
 
-def noted(frames: Iterable[Frame], points: list[np.ndarray]) -> Iterator[Frame]:
+def collect_points(frames: Iterable[Frame], points: list[np.ndarray]) -> Iterator[Frame]:
     """The frames, while some of the points [M, 3] of each are appended to `points`."""
     for frame in frames:
         pixels = np.argwhere(frame.depth > 0)
@@ -103,10 +105,10 @@ def frames(scene: OpenedScene, progress: Progress) -> Iterator[Frame]:
         depth, covered = scene.renderer.render_depth(view)
         depth[covered < OPAQUE] = 0
         color, _ = scene.renderer.render(view)
-        yield Frame(without_edges(depth), color, camera.K, camera.cam_from_world)
+        yield Frame(drop_edges(depth), color, camera.K, camera.cam_from_world)
 
 
-def without_edges(depth: np.ndarray) -> np.ndarray:
+def drop_edges(depth: np.ndarray) -> np.ndarray:
     """Depth [H, W] as f32, 0 where unknown (0 or nan) or where a neighbour differs by STEP."""
     logarithm = np.log(np.where(depth > 0, depth, np.nan))
     on_edge = np.zeros(depth.shape, bool)

@@ -184,7 +184,7 @@ class OpenedScene:
           left.
         """
         names = () if label is None else (label,) if isinstance(label, str) else tuple(label)
-        filters = passing(self.exported, self.source, names, min_opacity, box)
+        filters = filter_masks(self.exported, self.source, names, min_opacity, box)
         if mask is not None:
             filters["mask"] = mask = np.asarray(mask)
             if mask.shape != (len(self),) or mask.dtype != bool:
@@ -233,7 +233,7 @@ class OpenedScene:
         return path
 
 
-def passing(
+def filter_masks(
     scene: Scene,
     path: Path,
     labels: tuple[str, ...],

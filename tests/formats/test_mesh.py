@@ -11,7 +11,7 @@ import pytest
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, write_mesh
-from chebsplat.stages.tools.mesh import STEP, away, noted, without_edges
+from chebsplat.stages.tools.mesh import STEP, away, drop_edges, noted
 from chebsplat.synthetic.rays import intrinsics, look_at, open3d
 
 SIZE = 96, 72
@@ -107,7 +107,7 @@ def test_pixels_at_a_step_of_depth_and_without_depth_are_left_out():
     depth = np.full((6, 8), 2.0, np.float32)
     depth[:, 4:] *= 1 + 2 * STEP
     depth[2, 1] = np.nan
-    found = without_edges(depth)
+    found = drop_edges(depth)
     assert (found[:, 3:5] == 0).all()
     assert found[2, 1] == 0
     assert (np.delete(found, (3, 4), axis=1) > 0).sum() == 6 * 6 - 1

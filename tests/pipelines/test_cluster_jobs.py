@@ -67,7 +67,7 @@ def test_steps_of_seconds_go_with_what_they_follow():
 @pytest.mark.parametrize("ablation", ["paper", ""])
 def test_no_job_of_a_sequence_or_of_what_is_half_done_waits_for_itself(tmp_path, ablation):
     (tmp_path / "mine.toml").write_text('scenes = ["toy", "office0", "toy", "office0"]')
-    plans = sequences.chain(
+    plans = sequences.plan_sequence(
         Planner(), str(tmp_path / "mine.toml"), "knowledge.start=rooms", ablation
     )
     steps = {step.key: step for plan in plans for step in plan.steps}
@@ -168,7 +168,7 @@ def test_steps_of_a_job_have_processes_of_their_own_and_end_with_the_first_that_
 ):
     told = tmp_path / "told"
     calls = [[f"step{k}", one, str(told)] for k, one in enumerate(codes)]
-    assert children.in_turn(_step, calls) == code
+    assert children.run_in_turn(_step, calls) == code
     lines = [line.split() for line in told.read_text().splitlines()]
     assert [name for name, _, _ in lines] == ["step0", "step1"][: 1 if codes[0] != "0" else 2]
     assert len({process for _, process, _ in lines} | {str(os.getpid())}) == len(lines) + 1

@@ -364,11 +364,11 @@ def test_links_name_artifacts_and_clean_stale_finds_what_nothing_names(work):
     assert (work / "toy/train").resolve() == plan.targets["train"]
     leftover = plan.targets["train"].with_name(".tmp-abc-999999999")
     leftover.mkdir()
-    found = {path for path, _ in store.unnamed()}
+    found = {path for path, _ in store.list_unreferenced()}
     assert found == {leftover, *(other.targets[s] for s in AFTER_TRAIN)}
     for path in found:
         store.remove(path)
-    assert store.unnamed() == []
+    assert store.list_unreferenced() == []
     assert all(store.is_fresh(path) for path in plan.targets.values())
 
 
@@ -400,9 +400,13 @@ def test_clean_stale_spares_what_a_running_plan_makes_and_reads(work):
     scratch.mkdir()
     os.utime(scratch, (1, 1))
     folder = running_plan(work, plan, os.getpid())
-    assert store.unnamed() == []
+    assert store.list_unreferenced() == []
     folder.rename(dead := folder.with_name("abc-999999999"))
-    assert {path for path, _ in store.unnamed()} == {dead, scratch, *plan.targets.values()}
+    assert {path for path, _ in store.list_unreferenced()} == {
+        dead,
+        scratch,
+        *plan.targets.values(),
+    }
 
 
 def test_a_failed_run_tells_a_stage_that_failed_from_one_that_was_killed(tmp_path, capfd):
