@@ -75,7 +75,7 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
             _make(tmp, out)
             yield tmp
             if force or not is_whole(out, manifest.schema):
-                manifest.files = _settled(tmp)
+                manifest.files = _settle(tmp)
                 (tmp / MANIFEST).write_text(
                     json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n"
                 )
@@ -233,7 +233,7 @@ def _entry(path: Path) -> dict[str, Any]:
     return {"sha256": sha256_file(path), "bytes": path.stat().st_size}
 
 
-def _settled(root: Path) -> dict[str, dict[str, Any]]:
+def _settle(root: Path) -> dict[str, dict[str, Any]]:
     """Make files outlive a power cut, and as readable as the user's umask has made their folder
     (some writers give a file to its owner alone); returns their sizes and digests by name.
 

@@ -43,7 +43,7 @@ class Frame(NamedTuple):
     pose: np.ndarray
 
 
-def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -> Mesh:
+def fuse_depth(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -> Mesh:
     """The surface of depth images, by a truncated signed distance on voxels of this edge.
 
     Args: open3d: the module; voxel, farthest: scene units, depth beyond which is ignored.
@@ -93,7 +93,7 @@ def meshlab() -> Any:
     return pymeshlab
 
 
-def cleaned(
+def clean_mesh(
     mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: int, voxel: float
 ) -> Mesh:
     """The mesh in at most `n_triangles`, floaters removed, small holes closed, labels dropped.

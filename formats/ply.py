@@ -153,7 +153,7 @@ def read_ply(
         parameters["log_scales"] = np.concatenate([parameters["log_scales"], thin], 1)
     if "filter_3D" in names:
         log.info("%s: its filter_3D is fused into scales and opacities", path)
-        parameters |= fused(
+        parameters |= fuse_filter(
             parameters["log_scales"], parameters["logit_opacities"], np.asarray(vertex["filter_3D"])
         )
     parameters, finite = drop_unusable(path, parameters)
@@ -164,7 +164,9 @@ def read_ply(
     return parameters, degree, labels
 
 
-def fused(log_scales: np.ndarray, logits: np.ndarray, size: np.ndarray) -> dict[str, np.ndarray]:
+def fuse_filter(
+    log_scales: np.ndarray, logits: np.ndarray, size: np.ndarray
+) -> dict[str, np.ndarray]:
     """Gaussians widened by an isotropic one of deviation `size` [N] (scene units), integral kept.
 
     Choices: scale² + size² for each scale², and opacities times the root of the ratio of the

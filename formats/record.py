@@ -66,7 +66,7 @@ class Record:
         Raises: ValueError naming an array of another dtype or shape, or a value that is not finite.
         """
         stored = dict(_arrays_of(self))
-        values = {name: _converted(name, value, spec) for name, (spec, value) in stored.items()}
+        values = {name: _convert(name, value, spec) for name, (spec, value) in stored.items()}
         check_lengths({name: (spec.axes, values[name].shape) for name, (spec, _) in stored.items()})
         self.write_attributes(out)
         for name, (spec, _) in stored.items():
@@ -308,7 +308,7 @@ def _built(
     return cls(**values)
 
 
-def _converted(name: str, value: Any, spec: Array) -> Any:
+def _convert(name: str, value: Any, spec: Array) -> Any:
     """A value in its stored dtype; a zarr array is in its place already and returned unchanged."""
     if not isinstance(value, np.ndarray | StoredArray):
         return value

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.stability.case import Outcome, beside, case
-from chebsplat.formats.meshes import Frame, Mesh, fused
+from chebsplat.formats.meshes import Frame, Mesh, fuse_depth
 from chebsplat.stages.tools.mesh import away, drop_edges
 from chebsplat.synthetic.rays import open3d
 
@@ -65,7 +65,7 @@ def walls(name: str) -> Outcome:
     is, in float32.
     """
     of, unit, shift = WALLS[name]()
-    made = fused(open3d(), of, unit * VOXEL, 10 * unit)
+    made = fuse_depth(open3d(), of, unit * VOXEL, 10 * unit)
     if len(made.triangles) < 500 or (made.colors != made.colors[0]).any():
         raise ValueError(f"{len(made.triangles)} triangles, or of another colour")
 
@@ -95,7 +95,7 @@ EMPTY: dict[str, Callable[[], list[Frame]]] = {
 @case("empty, {name}", name=EMPTY)
 def empty(name: str) -> Outcome:
     """How many vertices there are."""
-    made = fused(open3d(), EMPTY[name](), VOXEL, 10.0)
+    made = fuse_depth(open3d(), EMPTY[name](), VOXEL, 10.0)
     return Outcome(float(len(made.vertices) + len(made.triangles)), 0.0)
 
 

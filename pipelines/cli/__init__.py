@@ -10,7 +10,7 @@ import click
 
 from chebsplat.formats.splats import is_splat
 from chebsplat.pipelines.cli import about, knowledge, renders, runs, upkeep, uses
-from chebsplat.pipelines.cli.group import VERBOSELY, Guarded, logged, say
+from chebsplat.pipelines.cli.group import VERBOSELY, Guarded, log_to_stderr, say
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.stopping import streams
 
@@ -23,7 +23,7 @@ class Commands(Guarded):
             return super().main(*arguments, **options)
 
     def invoke(self, context: click.Context) -> NoReturn:
-        with logged(context):
+        with log_to_stderr(context):
             super().invoke(context)
 
     def list_commands(self, context: click.Context) -> list[str]:

@@ -46,7 +46,7 @@ class _Lines(logging.Formatter):
 
 
 @contextmanager
-def logged(context: click.Context) -> Iterator[None]:
+def log_to_stderr(context: click.Context) -> Iterator[None]:
     """Send the log to stderr within the block; a stage's command formats it in its own way."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Lines(context))

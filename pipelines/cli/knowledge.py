@@ -36,7 +36,7 @@ def show(name: str) -> None:
     """Points, novelty and trust of each lesson of a set, and the reason for its trust."""
     from chebsplat.formats.lesson import read_notes
     from chebsplat.pipelines.work import heads
-    from chebsplat.pipelines.work.summary import aligned
+    from chebsplat.pipelines.work.summary import align_columns
     from chebsplat.stages.recall import trusted, why
 
     rows = [("lesson", "scene", "points", "novelty", "trust", "because")]
@@ -44,7 +44,7 @@ def show(name: str) -> None:
         notes = read_notes(heads.folder(name) / key)
         figures = f"{notes['n_points']}", f"{notes['novelty']:.3f}", f"{trusted(notes):.2f}"
         rows.append((key, record["scene"], *figures, why(notes)))
-    for line in aligned(rows):
+    for line in align_columns(rows):
         print(line)
 
 

@@ -34,7 +34,7 @@ def run(plan: Path, key: str, again: bool = False) -> int:
     if again and (earlier := int(exit_file.read_text())) in FINAL:
         return earlier
     os.utime(exit_file)  # `status` says how long ago
-    with logged(Path(f"{files}.log")):
+    with log_to_file(Path(f"{files}.log")):
         code = exit_code(lambda: make(plan, key), plan.parent)
     with exit_file.open("r+") as handle:
         handle.write(CODE.format(code))
@@ -91,7 +91,7 @@ def prepare_stage(step: dict[str, Any], hashes: dict[str, Any]) -> Iterator[None
 
 
 @contextmanager
-def logged(path: Path) -> Iterator[None]:
+def log_to_file(path: Path) -> Iterator[None]:
     """Log to a file as well within the block; a full disk costs the log, not the stage."""
     try:
         log: logging.Handler = _Log(path)

@@ -21,7 +21,7 @@ from chebsplat.pipelines.planning.plan import Plan, Step
 from chebsplat.pipelines.running import cluster, job, processes
 from chebsplat.pipelines.work import heads, leases, store, summary
 from chebsplat.pipelines.work.store import say
-from chebsplat.pipelines.work.summary import aligned
+from chebsplat.pipelines.work.summary import align_columns
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.device import resolve
 from chebsplat.stages.runtime.progress import is_verbose
@@ -94,7 +94,7 @@ def say_result(plan: Plan, stage: str | None) -> None:
     """Report a scene's figures and doubts, and print the path of its report or last stage."""
     last = next(step for step in reversed(plan.steps) if stage in (None, step.stage))
     if last.stage == "report":
-        for line in aligned(summary.table(plan.targets["evaluate"])):
+        for line in align_columns(summary.table(plan.targets["evaluate"])):
             say(f"  {line}")
         for doubt in summary.doubts(plan.targets):
             say(f"  doubtful: {doubt}")

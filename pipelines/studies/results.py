@@ -88,7 +88,7 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     figures = read_figures(targets["evaluate"], evaluation)
     trace = read_trace(targets["train"], train)
     segmentation = figures.get("segmentation") or {}
-    row |= segmented(segmentation.get("scene", {}), segmentation.get("teacher", {}))
+    row |= segmentation_columns(segmentation.get("scene", {}), segmentation.get("teacher", {}))
     counts, guidance = scene.facts["by_degree"], train.facts.get("guidance", {})
     n_coefficients = sum(n * (degree + 1) ** 2 for degree, n in enumerate(counts))
     return row | {
@@ -149,7 +149,7 @@ def on_one_machine(rows: list[Row]) -> tuple[list[Row], list[str]]:
     return compared, sentences
 
 
-def segmented(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
+def segmentation_columns(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
     """Columns from a protocol's figures of a scene and of its teacher; None where not measured."""
     row: Row = {
         key: scene.get(key)
@@ -178,7 +178,10 @@ def over_scenes(rows: list[Row]) -> list[Row]:
         scene, teacher = ({} if None in of_side else rule(of_side) for of_side in sides)
         name = "+".join(sorted(row["scene"] for row in members))
         pooled.append(
-            dict.fromkeys(POOLED) | members[0] | {"scene": name} | segmented(scene, teacher)
+            dict.fromkeys(POOLED)
+            | members[0]
+            | {"scene": name}
+            | segmentation_columns(scene, teacher)
         )
     return pooled
 

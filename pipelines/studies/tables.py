@@ -190,7 +190,7 @@ def sections(study: Study, rows: list[Row]) -> list[Section]:
         for name in (name for name in by if name != study.baseline):
             cells = [*([condition] if condition else []), scene, name]
             for figure in SHOWN:
-                cells += reached(end, list(by[name].values()), figure)
+                cells += reach_cells(end, list(by[name].values()), figure)
             table.append(cells)
     if len(budgets) < 2 or not table:
         return []
@@ -209,7 +209,7 @@ def sections(study: Study, rows: list[Row]) -> list[Section]:
     return [Section(f"Seconds to what {study.baseline} ends with", note, [header, *table])]
 
 
-def reached(end: list[Row], budgets: list[list[Row]], figure: Figure) -> list[str]:
+def reach_cells(end: list[Row], budgets: list[list[Row]], figure: Figure) -> list[str]:
     """A figure of the baseline's last budget, its seconds, and a variant's seconds to reach it."""
     if any(row[figure.key] is None for some in (end, *budgets) for row in some):
         return ["-", "-", "-"]

@@ -121,7 +121,7 @@ def readable(path: Path) -> str:
     return os.path.relpath(path, here) if path.is_relative_to(here) else str(path)
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+def align_columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """Rows as lines, every column as wide as its widest cell."""
     if not rows:
         return []
@@ -134,7 +134,7 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 def show_rows(rows: Sequence[Sequence[str]]) -> None:
     """Print rows in aligned columns."""
-    for line in aligned(rows):
+    for line in align_columns(rows):
         print(line)
 
 

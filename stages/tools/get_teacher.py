@@ -62,9 +62,9 @@ def get_teacher(
                 f"{folder} exists and is not {origin}; remove it, or choose another --out"
             )
         return model, check(model)
-    files = {file: fetched(repository, file, revision) for file in (CLASSES, PREPARATION, graph)}
+    files = {file: fetch_file(repository, file, revision) for file in (CLASSES, PREPARATION, graph)}
     weights = {
-        name: fetched(repository, f"{PurePosixPath(graph).parent / name}", revision)
+        name: fetch_file(repository, f"{PurePosixPath(graph).parent / name}", revision)
         for name in weight_files(files[graph])
     }
     part = folder.with_name(f".part-{folder.name}")
@@ -102,7 +102,7 @@ def parsed(name: str) -> tuple[str, str, str]:
     return match[1], match[2] or "main", match[1].rpartition("/")[2].lower()
 
 
-def fetched(repository: str, file: str, revision: str) -> Path:
+def fetch_file(repository: str, file: str, revision: str) -> Path:
     """A file of a repository in the hub's cache, downloaded if need be, its checksum verified."""
     try:
         import httpx2
@@ -116,7 +116,9 @@ def fetched(repository: str, file: str, revision: str) -> Path:
     where = f"{repository}: {file}"
     try:
         token = token_for(constants.ENDPOINT)
-        return verified(Path(hf_hub_download(repository, file, revision=revision, token=token)))
+        return verify_checksum(
+            Path(hf_hub_download(repository, file, revision=revision, token=token))
+        )
     except errors.LocalEntryNotFoundError as fault:
         why = f"{constants.ENDPOINT} is not reached"
         if isinstance(fault.__cause__, errors.OfflineModeIsEnabled):
@@ -161,7 +163,7 @@ def refusal(fault: Any, repository: str, file: str, revision: str) -> str:
     return f"hf:{repository}: the hub answers {fault.response.status_code} for {file}; {AGAIN}"
 
 
-def verified(path: Path) -> Path:
+def verify_checksum(path: Path) -> Path:
     """A file of the hub's cache, if it has the checksum in its name: sha256, or git's own.
 
     Raises: InputError naming the file and both checksums.
@@ -216,13 +218,15 @@ def preparation(path: Path, repository: str) -> dict[str, Any]:
     Raises: InputError naming a step or a value that no key can replace.
     """
     try:
-        return feeding({key: value for key, value in document(path).items() if value is not None})
+        return preprocessing_keys(
+            {key: value for key, value in document(path).items() if value is not None}
+        )
     except ValueError as error:
         why = f"hf:{repository}: {PREPARATION} {error}"
         raise InputError(f"{why}; export the model yourself (docs/teachers.md)") from None
 
 
-def feeding(values: dict[str, Any]) -> dict[str, Any]:
+def preprocessing_keys(values: dict[str, Any]) -> dict[str, Any]:
     """Keys of a teacher's TOML from an image processor's values. Raises ValueError.
 
     Choices: a centre crop becomes the window's size; a photo keeps its aspect ratio.

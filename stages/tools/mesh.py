@@ -10,7 +10,7 @@ import numpy as np
 from chebsplat.cameras import unproject, upright
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.evaluation.metrics import features_at
-from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, meshlab
+from chebsplat.formats.meshes import Frame, Mesh, clean_mesh, fuse_depth, meshlab
 from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.tools.scene import OpenedScene
@@ -48,7 +48,7 @@ def mesh_of(
     edge = extent / N_VOXELS if voxel is None else voxel / scene.world.scale
     size = f"{edge * scene.world.scale:.3g}"
     depth_points: list[np.ndarray] = []
-    surface = fused(
+    surface = fuse_depth(
         open3d(), collect_points(frames(scene, progress), depth_points), edge, 2 * extent
     )
     if not len(surface.triangles):
@@ -57,7 +57,7 @@ def mesh_of(
         )
     facts = {"voxel": float(size), "triangles fused": len(surface.triangles)}
     if not raw:
-        surface = cleaned(surface, n_triangles, LEAST_PART * edge, LONGEST_HOLE, edge)
+        surface = clean_mesh(surface, n_triangles, LEAST_PART * edge, LONGEST_HOLE, edge)
     if not len(surface.triangles):
         raise DataFailure(
             f"nothing of the surface is larger than {LEAST_PART:g} voxels of {size}; take --raw"

@@ -27,7 +27,7 @@ from chebsplat.labels.names import folded
 from chebsplat.stages.pages.parts import rendered
 from chebsplat.stages.tools.query import (
     are_words,
-    embedded,
+    embed_words,
     is_closed,
     read_features,
     teacher_of,
@@ -140,7 +140,7 @@ def write_page(
         n=len(means),
         labels=about.get("labels"),
         words=f"{len(words.words):,}" if words else None,
-        weighed=weighed(words),
+        weighed=scoring_note(words),
         example=next((n for n in (scene.label_names or []) if n in ("chair", "sofa")), "a word"),
         note=f"SH degree {sh_degree}, quantised; made by chebsplat. Nothing is fetched or sent.",
         about=about,
@@ -228,7 +228,7 @@ def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: lis
         if folded(word) not in label_words
     ]
     reference = understood(teacher, others[0], phrases, calibrated=False)
-    vectors = embedded(others, features, model)
+    vectors = embed_words(others, features, model)
     order = sorted(range(len(names) + len(others)), key=[*names, *others].__getitem__)
     every = [*names, *others]
     words = Words(
@@ -240,7 +240,7 @@ def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: lis
     onnx_teacher = teacher_of(features, model)
     if not phrases and (calibration := calibration_of(onnx_teacher.path)) is not None:
         words.rivals, words.calibration = (
-            embedded(calibration.rivals, features, model),
+            embed_words(calibration.rivals, features, model),
             Calibration(**calibration.calibration),
         )
         words.uncalibrated = [
@@ -249,7 +249,7 @@ def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: lis
     return words
 
 
-def weighed(words: Words | None) -> str:
+def scoring_note(words: Words | None) -> str:
     """A page's sentence on how its words are scored."""
     if words is None or words.against is None:
         return "the labels alone"

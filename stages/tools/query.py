@@ -136,7 +136,7 @@ def understood(path: Path, text: str, phrases: list[str], calibrated: bool = Tru
         else None
     )
     if calibration is not None:
-        vectors = embedded([text, *calibration.rivals], features, model)
+        vectors = embed_words([text, *calibration.rivals], features, model)
         return Query(
             text,
             vectors[0],
@@ -146,7 +146,7 @@ def understood(path: Path, text: str, phrases: list[str], calibrated: bool = Tru
             Calibration(**calibration.calibration),
         )
     try:
-        vectors = embedded([text, *(phrases or CANONICAL)], features, model)
+        vectors = embed_words([text, *(phrases or CANONICAL)], features, model)
     except InputError as error:
         if phrases or repr(CANONICAL[0]) not in str(error):
             raise
@@ -173,7 +173,7 @@ def are_words(texts: list[str], teacher: TeacherModel) -> list[bool]:
     return [row >= 0 for row in found(texts, read_label_table(teacher.labels)[0], False)]
 
 
-def embedded(words: list[str], features: Features, model: str | None) -> np.ndarray:
+def embed_words(words: list[str], features: Features, model: str | None) -> np.ndarray:
     """Words [L] -> f32 [L, C] by the ONNX teacher. Raises InputError if that has changed."""
     vectors = text_embeddings(words, teacher_of(features, model))
     if features.channels is not None:

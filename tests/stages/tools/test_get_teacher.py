@@ -249,7 +249,8 @@ def test_weights_beside_a_graph_come_along_and_count_in_its_checksum(tmp_path, m
     (held / "config.json").write_text(json.dumps({"id2label": dict(enumerate(CLASSES))}))
     (held / "preprocessor_config.json").write_text(json.dumps(PREPARATION))
     monkeypatch.setattr(
-        "chebsplat.stages.tools.get_teacher.fetched", lambda repository, file, revision: held / file
+        "chebsplat.stages.tools.get_teacher.fetch_file",
+        lambda repository, file, revision: held / file,
     )
     model, _ = get_teacher(NAME, tmp_path / "out")
     assert (tmp_path / "out/model.onnx_data").is_file()
