@@ -107,7 +107,7 @@ def _put(tmp: Path, out: Path, manifest: Manifest, force: bool) -> None:
         os.rename(tmp, out)
     except OSError:
         if not force and is_whole(out, manifest.schema):
-            return  # a twin was faster
+            return  # another run was faster
         check_place(out, manifest.schema, manifest.key, force)
         os.rename(out, replaced)
         try:
@@ -142,7 +142,7 @@ def check_place(out: Path, schema: str, key: str, force: bool = False) -> None:
         )
     try:
         standing = parse_manifest(out)
-    except InputError:  # it may be anyone's: nobody is told to delete it
+    except InputError:  # it may be the user's: no advice to delete it
         raise InputError(
             f"{out / MANIFEST} is no manifest: nothing was replaced; choose another --out"
         ) from None

@@ -10,7 +10,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.files import parse_json
 
 NAME = "dataparser_transforms.json"
-ABOVE = 3  # folders above a splat's own that are looked in
+ABOVE = 3  # parent folders of a splat that are searched
 
 
 def beside(ply: Path) -> Path | None:

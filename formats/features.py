@@ -77,7 +77,7 @@ class FeatureWriter:
             (self.folder / "done").mkdir(parents=True)
             atomic_write(state, settings)
         self._arrays: dict[str, Any] = {}
-        self._holds: dict[int, list[str]] = {}  # view -> names of its arrays
+        self._holds: dict[int, list[str]] = {}  # names of arrays by view
         for marker in (self.folder / "done").iterdir():
             arrays = marker.read_text().split()
             if marker.name.isdigit() and all(

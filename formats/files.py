@@ -23,7 +23,7 @@ from typing import Any
 
 from chebsplat.errors import ChebsplatError, DiskFailure, InputError
 
-# bytes of text: a transforms.json of 20,000 frames; as JSON it takes up to 25 times as much memory
+# bytes of text, as a transforms.json of 20,000 frames; parsed JSON takes up to 25 times the memory
 LARGEST = 32 << 20
 LARGEST_TOML = 1 << 20  # tomllib reads about 2 MB a second
 RESTORE = "restore the file"
@@ -82,7 +82,7 @@ def parse_json(
             {"parse_constant": _finite, "parse_float": _finite} if finite else {}
         )
         value = json.loads(text, object_pairs_hook=_once, **strict)
-        # half a character: it could be printed, hashed or written nowhere
+        # a lone surrogate can be neither printed nor hashed nor written
         if SURROGATE.search(text):
             json.dumps(value, ensure_ascii=False).encode()
     except RecursionError:
@@ -137,7 +137,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         sync(temporary)
         os.replace(temporary, path)
     finally:
-        with suppress(OSError):  # of the disk that has just failed
+        with suppress(OSError):  # the disk has just failed
             temporary.unlink(missing_ok=True)
     sync(path.parent)
 

@@ -26,11 +26,11 @@ FORMATS = ("PNG", "JPEG")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif")
 # ISO/IEC 23008-12
 HEIC_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}
-# of one image, and of all that are being decoded: that takes up to 12 bytes a pixel
+# of one image, and of all being decoded at once, at up to 12 bytes a pixel
 MAX_PIXELS = 64_000_000
-MAX_SIDE = 65_535  # what JPEG can hold
+MAX_SIDE = 65_535  # JPEG's limit
 INCOMPLETE = "the source is incomplete"
-# What Pillow raises on damaged pixels, and struct and its own parsers on damaged EXIF.
+# Raised by Pillow on damaged pixels, and by struct and its parsers on damaged EXIF.
 DAMAGE = (OSError, SyntaxError, ValueError, struct.error, EOFError, LookupError, TypeError,
           AttributeError, ArithmeticError)  # fmt: skip
 SUBSECTION, ORIENTATION, FOCAL_35 = 0x8769, 0x0112, 0xA405  # EXIF tags
@@ -151,7 +151,7 @@ def _opened(path: Path, inspect: Callable[[Any], None], remedy: str) -> Any:
     from PIL import Image, UnidentifiedImageError
 
     regular(path, remedy)
-    # Pillow's own limit lies above ours
+    # Pillow's own limit is higher than ours
     warnings.simplefilter("error", Image.DecompressionBombWarning)
     try:
         with Path(path).open("rb") as handle:

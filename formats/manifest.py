@@ -33,7 +33,7 @@ class Manifest:
     versions: dict[str, str] = field(default_factory=dict)
     device: str = "cpu"
     threads: int = 1
-    seconds: float = 0.0  # of all processes that worked on it
+    seconds: float = 0.0  # of all its processes
     # see `stages.runtime.machine.Stopwatch.processes`
     processes: list[dict[str, Any]] = field(default_factory=list)
     files: dict[str, dict[str, Any]] = field(default_factory=dict)

@@ -16,12 +16,12 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.files import atomic_path
 
 BLOCK = 16  # voxels along a block of the grid
-N_BLOCKS = 20_000  # that the grid begins with; it grows
-TRUNCATED = 4.0  # voxels, where the signed distance ends
-LEAST_WEIGHT = 3.0  # views, more than which have seen a voxel of the surface
-TOUCHED = 4  # open3d looks at every fourth pixel along each axis for blocks that a frame touches
-EASY = 100_000  # triangles that the quadric collapse takes about a second for
-PER_CELL = 0.85  # of a fused mesh's triangles that clustering in cells of its own voxels leaves
+N_BLOCKS = 20_000  # initial blocks of the grid, which grows
+TRUNCATED = 4.0  # voxels of truncation
+LEAST_WEIGHT = 3.0  # a voxel of the surface is in more views than this
+TOUCHED = 4  # open3d samples every fourth pixel along each axis for blocks of a frame
+EASY = 100_000  # triangles that the quadric collapse handles in about a second
+PER_CELL = 0.85  # share of a fused mesh's triangles that clustering by its own voxels keeps
 GLTF_FLOAT, GLTF_UINT, GLTF_UBYTE, GLTF_VERTICES, GLTF_INDICES = 5126, 5125, 5121, 34962, 34963
 
 
@@ -112,7 +112,7 @@ def clean_mesh(
         mincomponentdiag=pymeshlab.PureValue(least_diagonal)
     )
     meshes.meshing_repair_non_manifold_edges()
-    # a selection alone would be decimated
+    # otherwise only the selection would be decimated
     meshes.meshing_close_holes(maxholesize=longest_hole, newfaceselected=False)
     count, clustered = meshes.current_mesh().face_number(), max(n_triangles, EASY)
     if count > clustered:

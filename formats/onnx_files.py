@@ -47,8 +47,8 @@ def _named(path: Path, stamp: tuple[int, ...]) -> tuple[str, ...]:
 
     try:
         model = onnx.load(path, load_external_data=False)
-    except Exception:  # protobuf's own, whose package is none that we depend on
-        return ()  # no graph: onnxruntime says so
+    except Exception:  # protobuf's own error, of a package that we do not depend on
+        return ()  # no graph; onnxruntime reports it
     external = onnx.TensorProto.EXTERNAL
     names = [
         os.path.normpath(entry.value)

@@ -14,13 +14,13 @@ import numpy as np
 
 BYTES = {"means": 9, "log_scales": 3, "quats": 4, "opacities": 1, "colors": 3}  # of a Gaussian
 C0 = 0.28209479177387814  # of SH band 0, from coefficients to colours
-# ln of what a scale may be beside the longest axes: of 5 % of the Gaussians, thinner than a pixel,
-# and of 95 %, flat
+# ln of the range of scales, relative to the longest axes of 5 % (thinner than a pixel) and of 95 %
+# (flat) of the Gaussians
 LEAST, MOST = -4.0, 12.0
-# From the middle, in extents of 90 % of the centres: what lies farther is drawn there, as small as
-# it looks
+# from the middle, in extents of 90 % of the centres: Gaussians beyond are drawn there, scaled down
+# to the same apparent size
 FARTHEST = 1000.0
-COLORS = (-1.0, 3.0)  # of SH degree 0 in training's [0, 1]; beyond it no pixel can tell
+COLORS = (-1.0, 3.0)  # of SH degree 0 in training's [0, 1]; values beyond are invisible
 
 
 @dataclass
@@ -151,7 +151,9 @@ def from_smallest_three(planes: np.ndarray) -> np.ndarray:
     return unit
 
 
-OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # places beside the largest
+OTHERS = np.array(
+    [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]
+)  # indices other than the largest entry's
 
 
 def to_bytes(arrays: dict[str, np.ndarray]) -> tuple[bytes, dict[str, Any]]:

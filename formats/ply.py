@@ -24,8 +24,8 @@ REST = {0: 0, 1: 3, 2: 8, 3: 15}  # coefficients beyond band 0, by degree
 _FIXED = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 _TAIL = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 HEADER = 1 << 20  # bytes that a header may take
-THIN = 1e-3  # of the smaller scale of a disc (2DGS): how thick it is taken
-# of the Gaussians of a file: beyond it the file is damaged, and not only some of them
+THIN = 1e-3  # thickness of a 2DGS disc, relative to its smaller scale
+# share of a file's Gaussians: beyond it the whole file counts as damaged
 MOST_UNUSABLE = 0.5
 _PART = re.compile(rb"^[ \t]*(?:element[ \t]+\S+[ \t]+(\d{1,30})|(property))\b", re.MULTILINE)
 
@@ -121,7 +121,7 @@ def read_ply(
     def block(
         properties: list[str], inward: Callable[[np.ndarray], np.ndarray] = np.asarray
     ) -> np.ndarray:
-        with np.errstate(over="ignore"):  # of doubles; what is infinite then is refused below
+        with np.errstate(over="ignore"):  # of doubles; infinities are refused below
             return inward(np.stack([vertex[name] for name in properties], 1)).astype(np.float32)
 
     def whole(name: str, low: int, high: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from chebsplat.formats.ply import read_vertices
 from chebsplat.formats.record import Array, Record
 
 MOST = 20_000_000  # points; a room's scan has some hundred thousand
-FARTHEST = 1e6  # scene units: beyond, float32 tells no 0.06 apart
+FARTHEST = 1e6  # scene units: beyond, steps of float32 exceed 0.06
 
 
 @dataclass

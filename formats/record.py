@@ -28,7 +28,7 @@ from chebsplat.formats import artifact
 from chebsplat.formats.files import parse_json
 from chebsplat.formats.manifest import Manifest, remedy_of
 
-BATCH = 2**25  # bytes that are compressed at a time
+BATCH = 2**25  # bytes compressed at a time
 ROWS = 65_536  # entries of the first axis in a chunk, where an array isn't read view by view
 METADATA = "zarr.json"
 
@@ -315,7 +315,7 @@ def _convert(name: str, value: Any, spec: Array) -> Any:
     values = np.asarray(value)
     if values.dtype != spec.dtype and not np.can_cast(values.dtype, spec.dtype, "same_kind"):
         raise ValueError(f"{name} is {values.dtype}, expected {spec.dtype}")
-    with np.errstate(over="ignore"):  # what is infinite then is refused below
+    with np.errstate(over="ignore"):  # infinities are refused below
         converted = values.astype(spec.dtype, copy=False)
     if (
         converted is not values

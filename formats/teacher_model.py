@@ -20,9 +20,11 @@ if TYPE_CHECKING:
     import numpy as np
 
 EMBEDDED = Path(__file__).parents[1] / "teachers/embedded.onnx"  # ships with the package
-MAX_LABELS = 2**15 - 1  # what maps of int16 can number
-MAX_SIDE = 4096  # pixels of what a model is fed
-LARGEST = 4  # mean or std of colours in 0 to 1, where a model is fed less than they are, too
+MAX_LABELS = 2**15 - 1  # the limit of int16 maps
+MAX_SIDE = 4096  # pixels of a model's input
+LARGEST = (
+    4  # largest plausible mean or std of colours in 0 to 1, of models with rescaled inputs, too
+)
 RESAMPLING = ("nearest", "lanczos", "bilinear", "bicubic", "box", "hamming")  # by Pillow's numbers
 FILES = ("labels", "text", "tokenizer")
 TEXT_PACKAGE = "minilm"  # `text` may name the optional extra instead of a file
@@ -128,7 +130,7 @@ def read_teacher(path: Path) -> TeacherModel:
     _check_range(settings, values)
     teacher = TeacherModel(path, **({"name": path.stem} | values))
     if "output" not in values and teacher.labels is not None and teacher.text is None:
-        with suppress(InputError):  # which whoever needs the table raises
+        with suppress(InputError):  # raised again where the table is needed
             if read_label_table(teacher.labels)[1] is None:
                 teacher = replace(teacher, output="logits", guessed=True)
     if teacher.output == "features" and teacher.labels is None and teacher.text is None:

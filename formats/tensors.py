@@ -27,8 +27,8 @@ from chebsplat.formats.files import regular
 from chebsplat.formats.manifest import Manifest, remedy_of
 
 Spec = tuple[Any, ...]  # of an array: its dtype, then its sizes
-LARGEST = 256 << 20  # bytes that the arrays asked for may take in all, unpacked
-# what numpy and zipfile raise, of which a RuntimeError is an unknown compression
+LARGEST = 256 << 20  # bytes of all requested arrays, unpacked
+# raised by numpy and zipfile; RuntimeError is an unknown compression
 _BROKEN = (OSError, ValueError, EOFError, RuntimeError, MemoryError, KeyError, TypeError,
            zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError)  # fmt: skip
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from chebsplat.errors import InputError
 
-# scene units that cameras may lie apart: near planes and thresholds are made for rooms
+# extents of cameras in scene units, for which near planes and thresholds are made
 EXTENTS = (0.1, 1000.0)
-FARTHEST = 1000.0  # extents from the origin: float32 tells 6e-5 of an extent apart there
+FARTHEST = 1000.0  # extents from the origin, where float32 has steps of 6e-5 extents
 
 
 @dataclass(frozen=True)
@@ -95,4 +95,4 @@ class World:
         return poses
 
 
-HERE = World()  # of scenes that are as their source has them
+HERE = World()  # the identity

@@ -39,7 +39,7 @@ class Commands(Guarded):
         of_a_file = any(word.startswith("--capture") or is_splat(word) for word in args[1:]) or (
             len(args) > 1 and not args[1].startswith("-")
         )
-        # `lift` is of a file, too
+        # `lift` is also a command on files
         if args[0] in STAGES and not (of_a_file and args[0] in self.commands):
             from chebsplat.stages.runtime.command import command
 

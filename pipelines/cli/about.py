@@ -11,7 +11,7 @@ import click
 
 from chebsplat.errors import ConfigError
 
-WIDEST = 36  # characters of a column of ranges
+WIDEST = 36  # characters of the column of ranges
 
 
 @click.command()

@@ -24,7 +24,7 @@ from chebsplat.stages.runtime.stopping import exit_code
 
 def say(text: str) -> None:
     """Print a line of ours to stderr, where that is possible."""
-    with suppress(OSError):  # the terminal may be gone, and the disk of a log full
+    with suppress(OSError):  # the terminal may be closed, or the log's disk full
         print(f"chebsplat: {text}", file=sys.stderr)
 
 
@@ -62,7 +62,7 @@ class Guarded(click.Group):
     """A group whose commands return an exit code (nothing: 0) and may raise typed errors."""
 
     def invoke(self, context: click.Context) -> NoReturn:
-        gone = (BrokenPipeError,)  # whoever read stdout: click ends without a word
+        gone = (BrokenPipeError,)  # stdout's reader has gone: click ends silently
         context.exit(exit_code(partial(super().invoke, context), store.work(), say, gone))
 
     def list_commands(self, context: click.Context) -> list[str]:

@@ -151,7 +151,9 @@ def view(scene: str, sh: int, words: Path | None, against: list[str], up: Any) -
     out = out.absolute()
     _write_page(scene, out, sh, words, against, up)
     graphical = any(map(os.environ.get, ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")))
-    if not (graphical and webbrowser.open(out.as_uri())):  # without a screen it may be one of text
+    if not (
+        graphical and webbrowser.open(out.as_uri())
+    ):  # without a screen it may be a text browser
         print("no browser can be opened from here; open this file in one", file=sys.stderr)
 
 

@@ -33,7 +33,9 @@ def query(scene: str, text: str, against: list[str], top: int) -> None:
 
     opened = load(scene)
     answer = opened.ask(text, against)
-    assert opened.labels is not None and opened.label_names is not None  # of a scene that answers
+    assert (
+        opened.labels is not None and opened.label_names is not None
+    )  # a scene that can be queried has labels
     print(answer, *table(answer, opened.labels, opened.label_names, top), sep="\n")
 
 

@@ -25,8 +25,8 @@ PLUMBING = tuple(
     f"chebsplat.{name}."
     for name in ("settings", "stages.settings", "stages.registry", "stages.runtime")
 )
-TEMPLATES = {".html", ".css", ".js"}  # of a package: what its modules fill
-# of extras: count where a scene uses them
+TEMPLATES = {".html", ".css", ".js"}  # templates that a package's modules fill
+# of extras: part of the key where a scene uses them
 OPTIONAL = {"av", "gsplat", "pillow_heif", "tokenizers", "transformers"}
 # Settings that are paths of raw files: their content is hashed in place of the path.
 PLACES = (

@@ -26,12 +26,12 @@ from chebsplat.stages.sources.common import unread
 from chebsplat.stages.teacher_models.text_encoder import found
 
 LIFTED = "train.features is lifted"
-# kinds that hold photos of any place
+# kinds of sources with photos of any place
 PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes", "video")
-POSELESS = ("photos", "video")  # kinds that bring no poses
+POSELESS = ("photos", "video")  # kinds without poses
 UNASKED = "no 2D teacher is named"
 HOW = (
-    "to label photographs, fetch one with `chebsplat get-teacher segformer-b0-ade` and name it with "
+    "to label photographs, fetch one with `chebsplat get-teacher segformer-b0-ade` and name it by "
     "set=teacher.model=MODEL.onnx (docs/teachers.md); the embedded one (set=teacher.kind=embedded) "
     "was trained on generated rooms only"
 )

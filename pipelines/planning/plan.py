@@ -60,9 +60,9 @@ class Step:
     key: str
     path: Path
     inputs: dict[str, Path]
-    sections: dict[str, Any]  # what the stage reads of the config
+    sections: dict[str, Any]  # the part of the config that the stage reads
     code: dict[str, Any]
-    raw: Hashes = field(default_factory=dict)  # of the files outside the store that it reads
+    raw: Hashes = field(default_factory=dict)  # of the raw files that it reads
     # artifacts that are made first, although it does not read them
     after: list[Path] = field(default_factory=list)
 
@@ -182,7 +182,7 @@ def parsed(key: str, value: str) -> Any:
         return value
     try:
         return tomllib.loads(f"v = {value}")["v"]
-    # no TOML, a number of thousands of digits, nested a thousand times
+    # no TOML, thousands of digits, deep nesting
     except (ValueError, RecursionError):
         return {"on": True, "off": False}.get(value, value)
 
@@ -278,7 +278,7 @@ class Planner:
             if stage.name == "train" and earlier is not None:
                 inputs["earlier"] = earlier
             if stage.name == "recall":
-                inputs.pop("lesson", None)  # its own, which is for the scenes after it
+                inputs.pop("lesson", None)  # its own lesson, which is for later scenes
                 inputs |= lesson_paths(self._lessons(place, scene, start, identity, lessons))
                 if inputs.keys() == {"start"}:
                     store_inputs["knowledge"], left_out["recall"] = (

@@ -36,12 +36,12 @@ class Need:
     """Resources that a stage requests of a cluster."""
 
     minutes: int
-    mem_mb: int  # doubled at each further attempt
+    mem_mb: int  # doubled at each retry
 
 
 # Ten times the longest measured time and three times the memory: a job that requests too little is
 # lost, one that requests too much starts a little later.
-# measured in 18 scenes on two EPYC cores: seconds (median, most); most memory, in office0
+# Measured in 18 scenes on two EPYC cores: seconds (median, max); peak memory in office0.
 NEEDS = {
     "pose": Need(100, 4000),
     "ingest": Need(10, 2000),  # 21, 49; 306 MB
@@ -55,14 +55,14 @@ NEEDS = {
     "learn": Need(5, 4000),
     "recall": Need(5, 4000),
     "onnx": Need(5, 4000),
-    "train": Need(15, 4000),  # and by its steps: 80, 239 for 3000; 693 MB
+    "train": Need(15, 4000),  # plus the time of its steps: 80, 239 for 3000; 693 MB
     "lift": Need(5, 2000),  # 5, 12; 571 MB
     "refine": Need(5, 4000),  # 9, 22; 1083 MB
     "export": Need(5, 2000),  # 1, 2; 138 MB
     "evaluate": Need(5, 2000),  # 5, 27; 646 MB
     "report": Need(5, 2000),  # 2, 7; 144 MB
 }
-BESIDE = {  # the inputs beside which a step runs, as part of its job: the first that is made
+BESIDE = {  # a step joins the job that makes the first of these inputs
     "describe": ("points", "capture"),
     "encode": ("descriptors",),
     "learn": ("features", "encoding"),
@@ -70,8 +70,8 @@ BESIDE = {  # the inputs beside which a step runs, as part of its job: the first
     "agree": ("features",),
     "evaluate": ("scene",),
 }
-STEP_SECONDS = 0.08  # of a training, at most
-SHORT = 60.0  # seconds of a training that is no job of its own
+STEP_SECONDS = 0.08  # upper bound of a training step
+SHORT = 60.0  # seconds up to which a training is not a job of its own
 
 
 def profile(on: str) -> Path:
@@ -238,7 +238,7 @@ def watch_run(plan: Path) -> None:
         goes_on = True
         while goes_on:
             time.sleep(leases.EVERY)
-            with suppress(OSError):  # a file system that does not answer for a while is asked again
+            with suppress(OSError):  # a file system may be unavailable for a while
                 goes_on = store.holder(store.run_lease(plan.parent)) is not None
         end_itself()
 

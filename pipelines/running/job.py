@@ -33,7 +33,7 @@ def run(plan: Path, key: str, again: bool = False) -> int:
     exit_file = Path(f"{files}.exit")
     if again and (earlier := int(exit_file.read_text())) in FINAL:
         return earlier
-    os.utime(exit_file)  # `status` says how long ago
+    os.utime(exit_file)  # the start time that `status` shows
     with log_to_file(Path(f"{files}.log")):
         code = exit_code(lambda: make(plan, key), plan.parent)
     with exit_file.open("r+") as handle:

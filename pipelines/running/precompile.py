@@ -139,8 +139,8 @@ def descriptors() -> None:
     point_inputs(means, np.tile([0.0, 0, 1], (4 * N, 1)), shapes, up=np.array([0, 0, 1.0]))
 
 
-NEEDED = (colors, losses, adjoints, rasterizer)  # of any training
-SEMANTIC = (lifting, descriptors)  # of one with features
+NEEDED = (colors, losses, adjoints, rasterizer)  # by any training
+SEMANTIC = (lifting, descriptors)  # by one with features
 # a lift contains the kernels of an image
 SIDE_BY_SIDE = (rasterizer, lifting), (adjoints,), (losses, colors)
 

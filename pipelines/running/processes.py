@@ -54,7 +54,7 @@ def snakemake(
       beside: a command of ours that runs meanwhile.
     """
     reader, writer = os.pipe()
-    # -P and PYTHONSAFEPATH: a module where the user stands, or in the work folder, is never run
+    # -P and PYTHONSAFEPATH: modules in the current or the work folder are never imported
     command = [sys.executable, "-P", "-c", SNAKEMAKE, str(PATIENCE), str(words), json.dumps(beside)]
     environment = os.environ | {"PYTHONSAFEPATH": "1", **environment}
     with open(reader, "rb") as standard_input, open(writer, "wb"):
@@ -68,7 +68,7 @@ def snakemake(
         )
         try:
             with pause_together(process):
-                while process.poll() is None:  # a signal that another thread takes wakes no `wait`
+                while process.poll() is None:  # `wait` does not wake on another thread's signal
                     time.sleep(0.02)
             return process.returncode
         finally:
@@ -82,7 +82,7 @@ def pause_together(process: subprocess.Popen[bytes]) -> Iterator[None]:
 
     def pause(_number: int, _frame: FrameType | None) -> None:
         os.killpg(process.pid, signal.SIGSTOP)
-        os.kill(os.getpid(), signal.SIGSTOP)  # until someone has us go on
+        os.kill(os.getpid(), signal.SIGSTOP)  # until SIGCONT
         os.killpg(process.pid, signal.SIGCONT)
 
     before = signal.signal(signal.SIGTSTP, pause)
@@ -97,7 +97,7 @@ def end(process: subprocess.Popen[bytes]) -> None:
     with suppress(ProcessLookupError):  # it is gone
         for number in (signal.SIGTERM, signal.SIGKILL):
             os.killpg(process.pid, number)
-            os.killpg(process.pid, signal.SIGCONT)  # a stop may come in the middle of a pause
+            os.killpg(process.pid, signal.SIGCONT)  # it may be paused
             until = time.monotonic() + PATIENCE
             while time.monotonic() < until:
                 process.poll()
@@ -121,7 +121,7 @@ def run_in_turn(command: Callable[[list[str]], None], calls: list[list[str]]) ->
         try:
             process.join()
         finally:
-            process.terminate()  # does nothing to one that has ended
+            process.terminate()  # without effect on an ended one
             process.join(PATIENCE)
             process.kill()
         if process.exitcode:

@@ -26,7 +26,7 @@ from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.device import resolve
 from chebsplat.stages.runtime.progress import is_verbose
 
-HERE = Path(__file__).parents[1]  # of the Snakefile
+HERE = Path(__file__).parents[1]  # the Snakefile's folder
 
 
 @dataclass
@@ -70,7 +70,7 @@ def execute(
                 f"{len(steps) - len(stale)}"
             )
             code = snakemake(stale, cores, device=device, on=on).code
-    finally:  # a run that is stopped names what it has finished
+    finally:  # a stopped run links its finished steps
         for plan in plans:
             store.link(plan.title, plan.targets)
             add_lesson(plan)
@@ -211,7 +211,9 @@ def failures(steps: list[Step], folder: Path, words: Path) -> Outcome:
             failed[step.key], killed = (1, "killed before it could report", log), True
             say(f"{step.stage} was killed before it could report; log: {log}")
     if killed or not failed:
-        with explained(store.work()):  # whoever failed could not say whether the disk is full
+        with explained(
+            store.work()
+        ):  # find out if the disk is full, which the failed job could not report
             atomic_write(folder / "room", bytes(1 << 20))
             (folder / "room").unlink()
     if not failed:

@@ -31,12 +31,12 @@ from chebsplat.pipelines.studies.tables import (
 from chebsplat.stages.pages.parts import rendered
 from chebsplat.stages.report import LARGEST
 
-PAGE = Path(__file__).with_name("page.html")  # a jinja2 template; it fetches nothing from anywhere
+PAGE = Path(__file__).with_name("page.html")  # a jinja2 template without external resources
 NAME = "study.html"
 PICTURE = "error-against-time.png"
 # Markdown's special characters
 MARKUP = re.compile(r"([\\`*_{}\[\]|~$^#])|^(\d*)([-+=.)])(?=[\s=-]|$)")
-NARROW = 1100  # pixels of a screen; the comparison's tables take more
+NARROW = 1100  # pixels of a screen that is narrower than the comparison's tables
 
 
 def write(

@@ -52,14 +52,14 @@ FIGURES = (
     Figure("frames_per_second", "frames/s", 1, 1, True, "rendered_on"),
     Figure("train_seconds", "training, s", 1, 1, True, "trained_on"),
 )
-OF_TEACHER = ("miou", "boundary_miou", "point_miou")  # figures of single photos, too
+OF_TEACHER = ("miou", "boundary_miou", "point_miou")  # figures that single photos have, too
 OTHERS = (
     *(f"{key}_teacher" for key in OF_TEACHER), "classes", "pixels", "protocol", "resolution",
     "split", "held_in_psnr", "steps", "clock", "device", "trained_on", "rendered_on", "train_key",
     "evaluate_key",
 )  # fmt: skip
 IDENTITY = ("condition", "variant", "budget", "scene", "seed", "state")
-# what a protocol may work out over all scenes together
+# figures that a protocol may compute over all scenes
 POOLED = ("miou", "miou_gain", "macc", "oa")
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
 

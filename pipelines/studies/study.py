@@ -26,13 +26,13 @@ from chebsplat.stages.runtime.config import checked
 from chebsplat.stages.settings import Section, Text, printable
 from chebsplat.stages.sources.common import spellings
 
-LAST = "evaluate"  # a study measures; a page and an ONNX file for each of its runs would be waste
+LAST = "evaluate"  # the last stage of a run: a study needs no page and no ONNX file of each
 
 
 Sections = dict[str, dict[str, Any]]  # of a config; their values are checked where a run is planned
 Name = Annotated[str, Field(max_length=200), AfterValidator(printable)]
-EVERY = 1.0  # seconds between looks at what is finished
-REFRESH = 300.0  # seconds at least between two writings of a study's page while it runs
+EVERY = 1.0  # seconds between polls for finished runs
+REFRESH = 300.0  # least seconds between two writings of the page during a study
 
 
 class Budgets(Section):
@@ -164,7 +164,7 @@ class Run:
     scene: str
     seed: int
     plan: Plan = field(compare=False)
-    # of the scenes whose lessons it starts from
+    # plans of the scenes whose lessons it starts from
     before: tuple[Plan, ...] = field(default=(), compare=False)
 
     @property
@@ -333,7 +333,7 @@ def execute(
                     say(f"  {title}: {describe(waiting)}; {at_once}")
                     ended = snakemake(waiting, cores, threads, device, on)
                     outcome = Outcome(max(outcome.code, ended.code), outcome.failed | ended.failed)
-                finally:  # a study that is stopped names what it has finished
+                finally:  # a stopped study links its finished runs
                     store.link(f"study-{name}", links)
     store.link(f"study-{name}", links)
     return outcome

@@ -34,7 +34,7 @@ def name_of(folder: Path) -> str:
     """A folder's name. Raises ConfigError if another one has run under it."""
     digits = hashlib.sha256(os.fsencode(folder)).hexdigest()[:4]
     short = folder_name(folder).encode()[: LONGEST - len("folder--1a2b")].decode(errors="ignore")
-    ours = short.startswith("study-")  # so begin links of studies
+    ours = short.startswith("study-")  # the prefix of studies' links
     name = f"folder-{short}-{digits}" if ours else f"{short}-{digits}"
     if (other := owner(name)) not in (None, str(folder)):
         raise ConfigError(

@@ -88,7 +88,7 @@ def forget(name: str, key: str) -> None:
             f"{name} has no lesson {key}" + (f"; did you mean {near[0]}?" if near else "")
         )
     place = folder(name) / key
-    # no run of the scene adds it again
+    # so that no run of the scene adds it again
     atomic_write(place.with_suffix(".json"), json.dumps({FORGOTTEN: True}))
     (place / "artifact.json").unlink()
     shutil.rmtree(place)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from filelock import SoftFileLease, Timeout
 
-EVERY = 5.0  # seconds between signs of life
+EVERY = 5.0  # seconds between heartbeats
 EXPIRES = 60.0  # seconds of silence after which a holder elsewhere counts as dead
 
 
@@ -56,4 +56,4 @@ def _lease(path: Path) -> SoftFileLease:
 
 def _machine(lease: SoftFileLease) -> str | None:
     owner = lease.owner
-    return owner.hostname.partition("?")[0] if owner else None  # a container's number follows
+    return owner.hostname.partition("?")[0] if owner else None  # the id of a container follows

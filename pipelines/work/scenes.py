@@ -108,7 +108,7 @@ def scene_values(scene: str) -> tuple[str, dict[str, Any]]:
 def folder_name(folder: Path) -> str:
     """A source's name: the last part of its path, and those above it up to one with a letter."""
     parts = (folder.with_suffix("") if is_video(folder.name) else folder).parts[1:]
-    # "dense/0" is no "0"
+    # "dense/0" is not named "0"
     words = next((k for k in range(1, len(parts)) if re.search(r"[a-zA-Z]", parts[-k])), 1)
     return re.sub(r"[^\w.-]+", "-", "-".join(parts[-words:])).lstrip(".") or "scene"
 

@@ -183,7 +183,7 @@ def _running(base: Path) -> set[Path]:
             if is_under_way(plan.parent):
                 for step in json.loads(plan.read_text())["steps"]:
                     paths |= {Path(step["path"]), *map(Path, step["inputs"].values())}
-        except FileNotFoundError:  # it has just ended
+        except FileNotFoundError:  # the run has just ended
             continue
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             advice = f"remove {plan.parent} if no run is under way"
@@ -201,7 +201,7 @@ def is_under_way(plans: Path) -> bool:
 def holder(path: Path) -> str | None:
     """The machine that holds a lease; None: nobody, or one elsewhere that has expired."""
     machine = leases.holder(path)
-    with suppress(FileNotFoundError):  # it has just been let go
+    with suppress(FileNotFoundError):  # it has just been released
         if machine == socket.gethostname() or (machine and age(path) < leases.EXPIRES):
             return machine
     return None
@@ -211,7 +211,7 @@ def _in_use(path: Path, running: set[Path]) -> bool:
     """A hidden folder of a running process or of a run under way, or younger than an hour."""
     if not path.name.startswith("."):
         return False
-    # .tmp-<key>-<process>, of this machine or of one that a run has sent its jobs to
+    # .tmp-<key>-<process>, of this machine or of a node of a run's
     if path.name.startswith(".tmp-"):
         return _owner_lives(path) or path.with_name(path.name.split("-")[1]) in running
     if not path.name.startswith(".part-"):

@@ -51,7 +51,7 @@ def quality(figures: Any) -> tuple[str, str, str]:
 
 def table(evaluation: Path) -> list[tuple[str, str, str]]:
     """(name, value, remark) of each figure of an evaluated scene; unmeasured ones are absent."""
-    # with zarr, which a list of scenes does not wait for
+    # imports zarr, which the list of scenes does not need
     from chebsplat.formats.evaluation import rests
 
     measured = figures(evaluation)
@@ -184,7 +184,7 @@ def runs() -> Iterator[tuple[str, list[State]]]:
         try:
             steps = json.loads(plan.read_text())["steps"]
             states = [state_of(plan.parent, step) for step in steps]
-        except FileNotFoundError:  # it has just ended
+        except FileNotFoundError:  # the run has just ended
             continue
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             yield f"{plan} is damaged; remove {plan.parent} if no run is under way", []

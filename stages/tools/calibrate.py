@@ -34,13 +34,13 @@ from chebsplat.synthetic import CLASS_NAMES
 
 log = logging.getLogger("chebsplat")
 
-# other seeds than all rooms' in synthetic/layout.py; here, so that no scene's key depends on them
+# not used in synthetic/layout.py; defined here, so that no scene's key depends on them
 SEEDS = range(21_000, 21_100)
 N_VIEWS, N_POINTS = 16, 20_000  # of a room
-FITTED = 2000  # points of a room that the probability is fitted to
-LEAST = 20  # points from which on a room has a class; with fewer the room is not counted
-FREQUENT = 1e-4  # share of points that a rival is the nearest word of
-FOLDS = 3  # parts of the rooms, of which each is measured by a fit to the others
+FITTED = 2000  # points of a room for the fit of the probability
+LEAST = 20  # points of a class in a room; with fewer, but some, the room is not counted
+FREQUENT = 1e-4  # share of points whose nearest word is a rival
+FOLDS = 3  # of cross-validation over rooms
 
 
 class Queries(NamedTuple):

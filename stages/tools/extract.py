@@ -12,7 +12,7 @@ from chebsplat.splats.parts import substantial
 from chebsplat.stages.tools.query import Query
 from chebsplat.stages.tools.scene import OpenedScene, filter_masks
 
-# or scene.spz --spz-version 3
+# for SPZ: scene.spz --spz-version 3
 CONVERT = "npx @playcanvas/splat-transform@2.7.1 scene.ply scene.compressed.ply"
 
 

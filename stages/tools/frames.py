@@ -145,7 +145,7 @@ def whole(path: Path, camera: Camera) -> bool:
         if path.suffix == ".npy":
             return bool(np.load(path, allow_pickle=False).shape == size[::-1])
         with opened(path) as image:
-            # its reader needs no end
+            # Pillow reads a file without its end
             return bool(image.size == size) and path.read_bytes().endswith(PNG_END)
     except (InputError, ValueError, OSError, EOFError) as error:
         log.warning("%s is rendered again: %s", path, error)

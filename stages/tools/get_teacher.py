@@ -30,7 +30,9 @@ from chebsplat.stages.settings import MAX_CHANNELS, TeacherSection
 from chebsplat.stages.teacher_models.label_space import closed_set, label_set, open_vocabulary
 from chebsplat.synthetic.layout import REFERENCE
 
-TEACHERS = {"segformer-b0-ade": "Xenova/segformer-b0-finetuned-ade-512-512"}  # ours: the hub's
+TEACHERS = {
+    "segformer-b0-ade": "Xenova/segformer-b0-finetuned-ade-512-512"
+}  # repository on the hub by our name
 REPOSITORY = re.compile(r"hf:([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?")
 GRAPH, CLASSES, PREPARATION = "onnx/model.onnx", "config.json", "preprocessor_config.json"
 WIDER = 4 / 3  # aspect ratio of a photo, for the square that a segmenter is trained on
@@ -130,7 +132,7 @@ def fetch_file(repository: str, file: str, revision: str) -> Path:
     except errors.HfHubHTTPError as fault:
         raise InputError(refusal(fault, repository, file, revision)) from None
     except (httpx2.TransportError, OSError, RuntimeError) as fault:
-        if isinstance(fault, OSError) and fault.errno is not None:  # of the disk
+        if isinstance(fault, OSError) and fault.errno is not None:  # an error of the disk
             raise
         message = str(fault).partition("\n")[0]
         raise InputError(f"{where} broke off ({message}); {AGAIN}") from None
@@ -254,7 +256,9 @@ def preprocessing_keys(values: dict[str, Any]) -> dict[str, Any]:
         raise ValueError(
             "turns the order of channels that are normalised apart (do_flip_channel_order)"
         )
-    whole = 1 if np.isclose(255 * factor, 1, 1e-9) else 255 * factor  # what 255 becomes
+    whole = (
+        1 if np.isclose(255 * factor, 1, 1e-9) else 255 * factor
+    )  # the value of 255 after rescaling
     if max(*mean, *std) > 1 and whole <= 1:
         raise ValueError(
             "has image_mean or image_std of colours in 0 to 255, and rescales to 0 to 1 before"

@@ -84,7 +84,7 @@ def lift_ply(
     publish("lift", lift.run, out / "lift", inputs, config)
     inputs = {"gaussians": out / "gaussians", "features": features, "lifted": out / "lift"}
     publish("export", export.run, out / "export", inputs, config)
-    for name, path in {"ingest": capture, "teacher": features}.items():  # as the links of a scene
+    for name, path in {"ingest": capture, "teacher": features}.items():  # like the links of a scene
         if not (out / name).exists():
             (out / name).symlink_to(path.resolve())
     facts = artifact.read_manifest(out / "lift").facts

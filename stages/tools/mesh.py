@@ -16,13 +16,13 @@ from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.tools.scene import OpenedScene
 from chebsplat.synthetic.rays import open3d
 
-N_VOXELS = 250  # along the longest side of the room, where no voxel is asked for
-OPAQUE = 0.6  # least coverage of a pixel whose depth counts
-# of its depth, by which a neighbouring pixel may lie deeper: beyond, a pixel is on an edge
+N_VOXELS = 250  # along the longest side of the room, by default
+OPAQUE = 0.6  # least coverage of a pixel with depth
+# relative depth difference of neighbouring pixels beyond which they are on an edge
 STEP = 0.05
 LONGEST_HOLE = 60  # edges
-N_TRIED = 100  # points of a view, at most, whose distance from the mesh is measured
-LEAST_PART = 12.0  # voxels across a connected part that stays
+N_TRIED = 100  # most points of a view for the distance from the mesh
+LEAST_PART = 12.0  # least diagonal of a connected part, voxels
 
 
 def mesh_of(

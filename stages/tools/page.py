@@ -38,7 +38,7 @@ from chebsplat.stages.tools.up import Up, up_of
 log = logging.getLogger("chebsplat")
 
 TEMPLATE = Path(__file__).parents[1] / "pages/scene/page.html"
-WARM = 16  # colours of the scale of heat
+WARM = 16  # colours of the heat scale
 
 
 @dataclass
@@ -209,7 +209,7 @@ def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: lis
       alone.
     """
     names, rows = scene.label_names, scene.label_embeddings
-    assert names is not None and rows is not None  # the caller's
+    assert names is not None and rows is not None  # checked by the caller
     features, model = (None, None) if teacher is None else read_features(teacher)
     if teacher is None or features is None or is_closed(features):
         if phrases or more:

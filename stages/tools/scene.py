@@ -24,7 +24,7 @@ from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages.tools.query import Query, Relevancy, understood
 from chebsplat.views import View
 
-COVERED = 0.5  # of a pixel, below which it has no label
+COVERED = 0.5  # least coverage of a pixel with a label
 
 
 @dataclass(frozen=True, eq=False)
