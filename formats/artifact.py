@@ -63,10 +63,10 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
     """Yield a scratch directory that becomes `out`, whole, when the block ends without an error.
 
     `manifest` may be completed inside the block (facts, seconds); its file table is filled in here.
-    A whole artifact that stands there, such as a twin's that was faster, is kept and ours is
-    discarded, unless `force` asks for ours. Until the block has ended, what stands at `out` stays.
-    Raises: InputError as `check_place`; ConfigError if there can be no `out`; DiskFailure if the
-      disk takes no more.
+    A whole artifact at `out`, as of another run that was faster, stays and ours is discarded,
+    unless `force` is set. Nothing at `out` is touched before the end of the block.
+    Raises: InputError as `check_place`; ConfigError if `out` cannot be made; DiskFailure if the
+      disk is full.
     """
     out = Path(out)
     tmp = out.parent / f".tmp-{out.name}-{os.getpid()}"
@@ -122,10 +122,9 @@ def _put(tmp: Path, out: Path, manifest: Manifest, force: bool) -> None:
 def check_place(out: Path, schema: str, key: str, force: bool = False) -> None:
     """Refuse `out` for an artifact unless nothing whole stands there, or `force` may replace it.
 
-    Choices: a folder that bears the artifact's key is its own, whatever a crash has left of it.
-      Elsewhere only an artifact of the same schema goes, by `force`, and with nothing beside what
-      its manifest lists.
-    Raises: InputError saying what stands there; nothing is removed.
+    Choices: a folder named by the artifact's key may be replaced, whatever a crash left in it.
+      Elsewhere only an artifact of the same schema may, by `force`, and without unlisted files.
+    Raises: InputError naming the obstacle; nothing is removed.
     """
     if os.path.islink(out):
         raise InputError(

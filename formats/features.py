@@ -56,8 +56,8 @@ class FeatureWriter:
     Args:
       folder:    of this writer alone, on the disk of the artifact that `finish` fills.
       names:     of the V views; shape: (h, w, C) of each.
-      made_with: what else the values depend on; a folder made with other names, shape or settings
-        starts anew.
+      made_with: further settings behind the values; a folder with other names, shape or settings is
+        emptied.
     """
 
     def __init__(

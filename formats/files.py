@@ -161,7 +161,7 @@ def sync(path: Path) -> None:
 def explained(folder: Path, scratch: bool = False) -> Iterator[None]:
     """Turn the disk's refusals into a DiskFailure that names the error's file, or `folder`.
 
-    Args: scratch: `folder` holds what is being written and nothing else; the message has its bytes.
+    Args: scratch: `folder` only holds the files being written; the message gives their bytes.
     Raises: DiskFailure; InputError naming a file that may not be read.
     """
     try:

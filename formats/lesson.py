@@ -20,9 +20,8 @@ SPECS: dict[str, Spec] = {"gram": ("float32", "half"), "cross": ("float32", "p",
 
 @dataclass
 class Lesson:
-    """sums: of the scene's points. notes: scene, teacher, points, words, ρ, σ_f, ρ′, and the
-    evidence of trust: whether its labels were given, `familiar`, and the share of labels that
-    shape and teacher have alike.
+    """sums: of the scene's points. notes: scene, teacher, points, words, ρ, σ_f, ρ′; evidence for
+    trust (labels given, `familiar`, share of labels common to shape and teacher).
     """
 
     sums: PlainSums

@@ -31,8 +31,8 @@ class Packed:
     log_scales: u8 [3, N]; quats: u8 [4, N], of u32: the largest entry's place in the 2 upper bits,
       the others in order (wxyz, the largest positive) as 10 bits each over ±1/√2.
     opacities:  u8 [N] of [0, 1]; colors: u8 [3, N], of SH degree 0, 1 is white.
-    sh1:        i8 [9, N], coefficients of band 1, coefficient-major; only where asked for.
-    features:   i8 [C, N]; only where given.
+    sh1:        i8 [9, N], coefficients of band 1, coefficient-major; optional.
+    features:   i8 [C, N]; optional.
     """
 
     arrays: dict[str, np.ndarray]

@@ -202,7 +202,7 @@ def write_array(path: Path, values: np.ndarray, spec: Array, compressed: bool = 
 
 
 def _put(files: dict[str, Any], folder: Path) -> None:
-    """Write what a memory store holds, by name, into a folder."""
+    """Write the files of a memory store into a folder."""
     for name, buffer in files.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -37,16 +37,16 @@ class TeacherModel:
     path:      the image encoder, `[1, 3, H, W]` float32 -> `[1, C, h, w]`.
     output:    "features", or "logits" of a closed-set segmenter: channel = index into the label
       list.
-    guessed:   whether the TOML leaves that out, and labels that are names alone, without `text`,
-      are taken for a segmenter's.
+    guessed:   true where the TOML has no `output`, and labels without embeddings and without `text`
+      suggest a segmenter.
     tensor:    the graph's output, or None: the one that fits.
-    mean, std: of colours in [0, 1], in the order that the model is fed, `order`: "RGB" or "BGR".
-    resample:  how photos are resized, of RESAMPLING.
+    mean, std: of colours in [0, 1], in the model's channel `order`, "RGB" or "BGR".
+    resample:  filter for resizing photos, of RESAMPLING.
     size:      (H, W) that the model takes, or None: any whose sides are multiples of `multiple`.
     base:      long side in pixels that an image is resized to at scale 1, or None: its own.
     origin:    source of a fetched model, sha256: its `model_sha256` then; None if not fetched.
-    labels:    table of names and embeddings; text, tokenizer: encoder of any words; prompt: what a
-      name is put into.
+    labels:    table of names and embeddings; text, tokenizer: encoder of any words; prompt: a
+      template for names.
     """
 
     path: Path

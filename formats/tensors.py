@@ -2,7 +2,7 @@
 
 Sizes that .npy and .npz declare are compared with their bytes before anything is allocated.
 Measured traps: a header of 100 bytes that declares terabytes, a zip of 400 KB that unpacks to 3 GB,
-a FIFO.
+  a FIFO.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ def run(stage: str | None, cores: int | None, device: str, on: str, **choice: An
 @with_scene
 @ON_DEVICE
 def plan(device: str, **choice: Any) -> None:
-    """Show what would run, what is fresh, and what the scene leaves out, and why."""
+    """Show the steps to run, the fresh ones, and those that the scene leaves out, with reasons."""
     from chebsplat.pipelines.running.run import device_of
     from chebsplat.pipelines.selection import plans
 

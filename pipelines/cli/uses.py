@@ -50,7 +50,7 @@ def query(scene: str, text: str, against: list[str], top: int) -> None:
 )
 @click.option("--labels", help="text file of labels; default: the teacher's own")
 def check_teacher(model: Path, photos: tuple[Path, ...], labels: str | None) -> None:
-    """Run images through a teacher MODEL (.onnx): what it is, costs and sees, what may be wrong."""
+    """Run images through a teacher MODEL (.onnx): settings, cost, labels and likely mistakes."""
     from chebsplat.stages.tools.get_teacher import check
 
     for what, finding in check(model, photos, labels):

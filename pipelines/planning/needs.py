@@ -132,12 +132,12 @@ def left_out_channels(kind: str, model: TeacherModel | None) -> dict[str, str]:
 
 
 def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, ...]:
-    """Packages that a teacher's text encoder runs on, if the scene asks it for words.
+    """Packages that a teacher's text encoder runs on, if the scene needs embeddings of words.
 
     Args: labels: the file of labels, `teacher.labels`.
-    Choices: what a capture calls its classes is not known before it is read. The sentence model of
-      the extra `text` is pinned to one version, so that it is left out where only such names could
-      need it; a model of the user's is not.
+    Choices: the class names of a capture are unknown before it is read. The sentence model of the
+      extra `text` has a fixed version, so it is not counted where only such names could need it; a
+      user's own model is.
     """
     if model is None or model.text is None or model.output != "features":
         return ()

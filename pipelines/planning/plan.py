@@ -1,4 +1,4 @@
-"""Config to keys to steps: what a scene runs, what is fresh, and what it leaves out and why."""
+"""From config to keyed steps: the steps of a scene, and those left out by reason."""
 
 from __future__ import annotations
 
@@ -190,10 +190,9 @@ def parsed(key: str, value: str) -> Any:
 class Planner:
     """Plans scenes; remembers hashes of code and raw files between runs.
 
-    Args: code: the folder of `chebsplat`; running: what is planned will run, so that the work
-      folder is made, and a folder gets its name for good; device: that steps which can use a GPU
-      run on; newer: scenes are pinned to the lessons that there are now; quality: a named set of
-      settings, before ablation and settings.
+    Args: code: the folder of `chebsplat`; running: plans will run, so that the work folder is made
+      and names of folders are reserved; device: of steps that can use a GPU; newer: pin scenes to
+      the present lessons; quality: a named set of settings, before ablation and settings.
     """
 
     def __init__(

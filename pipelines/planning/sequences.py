@@ -68,7 +68,7 @@ def plan_sequence(
 def plan_teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
     """The steps that train an encoder of shape for a teacher, by default the embedded one.
 
-    Raises: ConfigError on a closed-set teacher, whose classes no shape is taught.
+    Raises: ConfigError on a closed-set teacher, which has no features to learn.
     """
     file = (model or EMBEDDED).expanduser().resolve()
     teacher = read_teacher(file)

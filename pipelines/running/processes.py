@@ -111,7 +111,7 @@ def run_in_turn(command: Callable[[list[str]], None], calls: list[list[str]]) ->
 
     Each call has a process of its own, forked from one that has imported the common packages and
     done nothing else: a step then starts 1.3 processor seconds sooner, which on a cluster pays for
-    grouping steps into a job.
+      grouping steps into a job.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["torch", "numba", "zarr"])

@@ -52,7 +52,7 @@ FIGURES = (
     Figure("frames_per_second", "frames/s", 1, 1, True, "rendered_on"),
     Figure("train_seconds", "training, s", 1, 1, True, "trained_on"),
 )
-OF_TEACHER = ("miou", "boundary_miou", "point_miou")  # figures that single photos have, too
+OF_TEACHER = ("miou", "boundary_miou", "point_miou")  # figures of the teacher on single photos, too
 OTHERS = (
     *(f"{key}_teacher" for key in OF_TEACHER), "classes", "pixels", "protocol", "resolution",
     "split", "held_in_psnr", "steps", "clock", "device", "trained_on", "rendered_on", "train_key",
@@ -220,9 +220,8 @@ def groups(rows: list[Row], *names: str) -> dict[tuple, list[Row]]:
 def compare(rows: list[Row], baseline: str) -> list[Line]:
     """Mean ± spread over scenes and seeds, and paired differences against the baseline.
 
-    Choices: a pair needs both runs: what failed on either side drops out of the difference; the
-      line counts its runs. Where a protocol works out a figure over all scenes together, that of a
-      seed is one value, and needs all of them.
+    Choices: a difference uses pairs of which both runs finished; the line counts its runs. A figure
+      that a protocol computes over all scenes is one value a seed, and needs all scenes.
     """
     by_line = groups(rows, "condition", "budget", "variant")
     lines = []

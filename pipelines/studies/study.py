@@ -52,9 +52,9 @@ class Table(Section):
     """A condition that stands for a table of a paper, with scenes and variants of its own.
 
     Scenes lie in the folder that the environment variable `root` names, or one folder below it, and
-    hold `holds`. `teacher`: the variable that names the 2D teacher's model, which is asked for the
-      label set `labels`. `variants` are some of the study's, each with the row of `published` that
-      it stands for, "" for none. `published`: figures by row, in the units that a study shows.
+    hold `holds`. `teacher`: the variable that names the 2D teacher's model, scored by the label set
+      `labels`. `variants` are some of the study's, each with the row of `published` that it stands
+      for, "" for none. `published`: figures by row, in the units that a study shows.
     """
 
     root: Text

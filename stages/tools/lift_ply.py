@@ -167,7 +167,7 @@ def label_ply(
       up_option: against gravity, in the PLY's frame; unit: its units in a metre; None: by the
         room's extent.
     Returns: counts, and the share of each name.
-    Raises:  ConfigError if `out` exists or a word is not known; InputError on what cannot be read;
+    Raises:  ConfigError if `out` exists or a word is unknown; InputError on unreadable files;
       DataFailure where the splat shows no surface.
     Choices: shape is described on the surface rendered from inside, and carried to the Gaussians
       beside it. The confidence is that of the label among the words, times the length of the
