@@ -120,6 +120,14 @@ def unread_inputs(config: Any, stage: str) -> set[str]:
     return {"train": {"features"} if lifted else set(), "export": {"lifted"}}.get(stage, set())
 
 
+def colours_alone(config: Any) -> Any:
+    """The settings of a training that reads no features: alike for a scene without a teacher and
+    for one whose features are lifted later, so that a finished scene is named without training.
+    """
+    meaningless = {"semantics": True, "features": "trained", "feature_start": None}
+    return config.model_copy(update={"train": config.train.model_copy(update=meaningless)})
+
+
 def left_out_channels(kind: str, model: TeacherModel | None) -> dict[str, str]:
     """Why a scene keeps its teacher's channels, if it does."""
     if model is None:

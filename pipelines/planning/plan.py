@@ -19,6 +19,7 @@ from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines.planning.code import PACKAGE, PLACES, Code, step_key
 from chebsplat.pipelines.planning.needs import (
     Start,
+    colours_alone,
     left_out_channels,
     left_out_stages,
     media_packages,
@@ -296,8 +297,13 @@ class Planner:
                     )
                     continue
             keys = {role: path.name for role, path in inputs.items()}
+            without = stage.name == "train" and "features" not in inputs
             step = steps[stage.name] = self.step(
-                stage, config, inputs, keys, used.get(stage.name, ())
+                stage,
+                colours_alone(config) if without else config,
+                inputs,
+                keys,
+                used.get(stage.name, ()),
             )
             step.after = [steps[before].path for before in stage.after if before in steps]
             if stage.name == "ingest":
