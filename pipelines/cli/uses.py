@@ -183,9 +183,9 @@ def calibrate(model: Path | None, rooms: int, force: bool) -> None:
 @click.option(
     "--up",
     type=Upward(),
-    default="z",
+    default="auto",
     show_default=True,
-    help="against gravity: -y, 0,0,1, auto, ...",
+    help="against gravity: auto (by the room's shape), z, -y, 0,0,1, ...",
 )
 @click.option(
     "--unit",

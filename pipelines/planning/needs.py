@@ -119,6 +119,14 @@ def unread_inputs(config: Any, stage: str) -> set[str]:
     return {"train": {"features"} if lifted else set(), "export": {"lifted"}}.get(stage, set())
 
 
+def colours_alone(config: Any) -> Any:
+    """The settings of a training without features: the same without a teacher and with features
+    that are lifted later, so that a finished scene is labelled without training again.
+    """
+    meaningless = {"semantics": True, "features": "trained", "feature_start": None}
+    return config.model_copy(update={"train": config.train.model_copy(update=meaningless)})
+
+
 def left_out_channels(kind: str, model: TeacherModel | None) -> dict[str, str]:
     """The reason why a scene trains in its teacher's own channels, if it does."""
     if model is None:

@@ -20,6 +20,7 @@ from chebsplat.pipelines.planning.code import PACKAGE, PLACES, Code, step_key
 from chebsplat.pipelines.planning.needs import (
     Start,
     choose_start,
+    colours_alone,
     left_out_channels,
     left_out_stages,
     media_packages,
@@ -286,8 +287,13 @@ class Planner:
                     )
                     continue
             keys = {role: path.name for role, path in inputs.items()}
+            without = stage.name == "train" and "features" not in inputs
             step = steps[stage.name] = self.step(
-                stage, config, inputs, keys, extra_packages.get(stage.name, ())
+                stage,
+                colours_alone(config) if without else config,
+                inputs,
+                keys,
+                extra_packages.get(stage.name, ()),
             )
             step.after = [steps[before].path for before in stage.after if before in steps]
             if stage.name == "ingest":

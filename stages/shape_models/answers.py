@@ -46,9 +46,12 @@ def answered(knowledge: Knowledge, inputs: PointInputs) -> np.ndarray:
     """What knowledge says of points: f32 [N, 2 d], in the teacher's channels, then in those of
     words.
     """
-    return (
-        PointEncoder.restored(knowledge.encoder, knowledge.weights).encode(inputs) @ knowledge.map
-    )
+    return encoded(knowledge, inputs) @ knowledge.map
+
+
+def encoded(knowledge: Knowledge, inputs: PointInputs) -> np.ndarray:
+    """Features of shape of points, f32 [N, p]."""
+    return PointEncoder.restored(knowledge.encoder, knowledge.weights).encode(inputs)
 
 
 def into_channels(

@@ -19,7 +19,7 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.files import atomic_path
 from chebsplat.formats.gaussians import Gaussians
-from chebsplat.formats.knowledge import read_knowledge
+from chebsplat.formats.knowledge import Knowledge, read_knowledge
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.names import suggest
 from chebsplat.formats.ply import write_ply
@@ -32,11 +32,13 @@ from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import room_unit
 from chebsplat.lifting.surface import LOOKOUT_SIZE, lookouts
 from chebsplat.settings import DescribeSection
+from chebsplat.shape.lessons import novelty, scaled_novelty, summed
 from chebsplat.shape.point_inputs import point_inputs
 from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages import export, lift
+from chebsplat.stages.learn import KNOWN
 from chebsplat.stages.runtime.command import publish
-from chebsplat.stages.shape_models.answers import answered, units
+from chebsplat.stages.shape_models.answers import encoded, units
 from chebsplat.stages.shape_models.surfaces import shown
 from chebsplat.stages.teacher_models.text_encoder import found
 from chebsplat.stages.tools.page import foreign
@@ -193,9 +195,11 @@ def label_ply(
     )
     cloud = shown(parameters, poses, Ks, LOOKOUT_SIZE, unit)
     log.info("%d points of a surface, %.3g units a metre", len(cloud.means), unit)
-    answers = answered(
+    shape = encoded(
         prior, point_inputs(*cloud, up=up, unit=unit, describe=DescribeSection(**prior.describe))
     )
+    answers = shape @ prior.map
+    warn_of_new_kind(prior, shape, answers)
     normals = surface_of(parameters)[0]
     carried, _ = carry(answers, cloud.means, cloud.normals, parameters["means"], normals, unit)
     labels, sure = decode(carried[:, carried.shape[1] // 2 :], units(prior.embeddings[rows]))
@@ -208,3 +212,19 @@ def label_ply(
         write_ply(temporary, parameters, degree, labels, words)
     shares = {word: float((labels == k).mean()) for k, word in enumerate(words)}
     return {"gaussians": len(labels), "points": len(cloud.means), "unit": unit, "shares": shares}
+
+
+def warn_of_new_kind(knowledge: Knowledge, shape: np.ndarray, answers: np.ndarray) -> None:
+    """Warn if shape features [N, p] are unlike all rooms of knowledge, so that its answers [N, 2 d]
+    are unreliable: ρ′ of Eq 15 is compared with that of held-out rooms, with surfaces worn as a
+    splat's.
+    """
+    sums = summed(shape, answers, np.ones(len(shape)))
+    new = scaled_novelty(novelty(sums, knowledge.scale, knowledge.basis), sums.spread())
+    if new > (largest := KNOWN * knowledge.card["novelty"]["held_out_worn"]):
+        log.warning(
+            "this scene's shape is unlike the rooms that names were learned in (rho' %.3f; rooms "
+            "have up to %.3f): do not rely on its labels",
+            new,
+            largest,
+        )

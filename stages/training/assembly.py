@@ -152,14 +152,7 @@ def _note_left_out(job: Job, train: TrainSection, has_semantics: bool, no_depth:
         if train.exposure == "off":
             job.left_out("exposure by photo", _why_no_exposure(given, stops))
     if not has_semantics:
-        why = (
-            "no teacher features: rendering only"
-            if train.semantics
-            else ("train.semantics is false")
-        )
-        if train.semantics and train.features == "lifted":
-            why = "train.features is lifted: they follow the training"
-        job.left_out("semantic branch", why)
+        job.left_out("semantic branch", "colours alone are trained: no teacher's features are read")
     if train.without != "nothing":
         job.left_out(f"{train.without} of the printed method", "train.without")
     unneeded = {

@@ -329,6 +329,14 @@ def test_lifted_features_reach_the_export_and_trained_ones_do_not_wait_for_them(
     assert "features" in by_stage["train"]
 
 
+def test_a_finished_scene_of_colours_is_named_later_without_training_it_again():
+    without = ("teacher.kind=none", "train.semantics=false", "train.features=lifted")
+    plans = [{s.stage: s.key for s in Planner().plan("toy", of).steps} for of in (*without, "")]
+    assert len({plan["train"] for plan in plans[:3]}) == 1
+    assert plans[3]["train"] != plans[0]["train"]
+    assert {"lift", "refine"} <= plans[2].keys() and "lift" not in plans[0]
+
+
 @pytest.mark.parametrize("kind", ["scenes", "qualities", "ablations", "sequences"])
 def test_every_config_of_ours_can_be_planned(kind, tmp_path, monkeypatch):
     monkeypatch.setenv("CHEBSPLAT_TEST_DATA", str(tmp_path))
