@@ -43,7 +43,7 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
     if stage == "learn" and sections["learn"]["points"]:
         return None, [_named(sections["learn"]["points"], "learn.points")]
     if stage == "teach":
-        return None, _of_model(sections["teach"]["model"])
+        return None, read_teacher(Path(sections["teach"]["model"] or EMBEDDED)).files()
     if stage == "evaluate" and sections["evaluate"]["lpips_weights"]:
         return None, [_named(sections["evaluate"]["lpips_weights"], "evaluate.lpips_weights")]
     return None, []
@@ -59,11 +59,6 @@ def _of_source(source: dict[str, Any]) -> tuple[Path | None, list[Path]]:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder; correct source.path")
     return folder, import_module(f"chebsplat.stages.sources.{kind}").files(folder)
-
-
-def _of_model(model: str | None) -> list[Path]:
-    """The files of a teacher, the embedded one if none is named."""
-    return read_teacher(Path(model) if model else EMBEDDED).files()
 
 
 def _of_teacher(settings: dict[str, Any]) -> list[Path]:

@@ -112,14 +112,8 @@ def calibrate(model: Path, n_rooms: int, progress: Progress) -> TeacherCalibrati
         "on_rooms_left_out": figures(room_evidence, fold_fits, queries),
     }
     names = [vocabulary[row] for row in rivals]
-    return TeacherCalibration(
-        teacher.name, model_sha256(model), names, rounded_coefficients(whole), facts
-    )
-
-
-def rounded_coefficients(of: Calibration) -> dict[str, float]:
-    """Coefficients by name, as stored."""
-    return {name: round(value, 4) for name, value in of._asdict().items()}
+    coefficients = {name: round(value, 4) for name, value in whole._asdict().items()}
+    return TeacherCalibration(teacher.name, model_sha256(model), names, coefficients, facts)
 
 
 def query_words(teacher: TeacherModel) -> Queries:

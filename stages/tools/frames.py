@@ -194,11 +194,6 @@ def save(kind: str, values: np.ndarray, path: Path, n_labels: int) -> None:
         image.save(path, "PNG")
 
 
-def as_picture(kind: str, path: Path, far: float) -> np.ndarray:
-    """A frame as a picture u8 [H, W, 3] for people; far: scene units, the darkest depth."""
-    return read_rgb(path) if kind != "depth" else depth_colors(np.load(path), far)
-
-
 def depth_colors(depth: np.ndarray, far: float) -> np.ndarray:
     """Depth [H, W], nan unknown, as u8 [H, W, 3]: turbo, red near; far: the darkest depth."""
     from matplotlib import colormaps
@@ -243,10 +238,11 @@ def render_video(
     check_size(next(iter(sizes)))
     kind, folder = shot.kinds[0], out.with_name(f".frames-{out.name}")
     files = render_frames(scene, cameras, shot, folder, progress)[kind]
-    far = 1.0
+    images: Iterable[np.ndarray] = map(read_rgb, files)
     if kind == "depth":
         far = max(float(np.nanmax(np.load(path), initial=1e-6)) for path in files)
-    write_video(out, (as_picture(kind, path, far) for path in files), next(iter(sizes)), rate)
+        images = (depth_colors(np.load(path), far) for path in files)
+    write_video(out, images, next(iter(sizes)), rate)
     shutil.rmtree(folder)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.meshes import Frame, Mesh, clean_mesh, fuse_depth, write_mesh
-from chebsplat.stages.tools.mesh import STEP, away, drop_edges, noted
+from chebsplat.stages.tools.mesh import STEP, away, collect_points, drop_edges
 from chebsplat.synthetic.rays import intrinsics, look_at, open3d
 
 SIZE = 96, 72
@@ -50,7 +50,7 @@ def test_a_fused_mesh_lies_on_the_surface_in_the_cameras_world_and_bears_its_col
 
 def test_a_mesh_is_as_far_from_the_depth_of_its_views_as_it_was_moved(ball):
     points = []
-    assert len(list(noted(of_a_ball(), points))) == 36
+    assert len(list(collect_points(of_a_ball(), points))) == 36
     seen = np.concatenate(points)
     assert 36 * 50 < len(seen) < 36 * 150
     np.testing.assert_allclose(np.linalg.norm(seen, axis=1), 0.5, atol=1e-3)
