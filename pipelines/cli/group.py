@@ -137,5 +137,5 @@ AGAINST = click.option(
     "--against",
     type=Phrases(),
     default="",
-    help="phrases it is weighed against; default: object,things,stuff,texture",
+    help="phrases to compare with; default: object,things,stuff,texture",
 )

@@ -52,9 +52,9 @@ WORDS = click.option(
     "--what",
     default="color",
     show_default=True,
-    help="of color,labels,depth,relevancy; with commas",
+    help="color,labels,depth,relevancy, or some of these",
 )
-@click.option("--query", help="words that relevancy is of")
+@click.option("--query", help="words of the relevancy")
 @AGAINST
 @SIZE
 @click.option(

@@ -14,7 +14,7 @@ from chebsplat.stages.runtime.device import DEVICES
 
 OPTIONS = [
     click.option("--scene", help="a name from `chebsplat scenes`, a folder, or a video"),
-    click.option("--sequence", help="scenes in order, each with what those before it taught"),
+    click.option("--sequence", help="scenes in order, each with the lessons of those before it"),
     click.option("--set", "settings", default="", help="section.key=value,..."),
     click.option(
         "--quality",
@@ -25,12 +25,12 @@ OPTIONS = [
     click.option(
         "--knowledge",
         default="",
-        help="what it starts from: none, shipped, a set of lessons, a folder/",
+        help="starting knowledge: none, shipped, a set of lessons, a folder/",
     ),
     click.option(
         "--newer",
         is_flag=True,
-        help="start from the lessons that there are now, and stay with these",
+        help="pin the scene to the present lessons",
     ),
 ]
 
@@ -99,8 +99,8 @@ def plan(device: str, **choice: Any) -> None:
 )
 @click.option("--threads", type=click.IntRange(1), default=2, show_default=True, help="of each job")
 @click.option("--out", type=click.Path(path_type=Path), help="default: build/studies/NAME")
-@click.option("--plan", "only_plan", is_flag=True, help="say what would run, and stop")
-@click.option("--no-run", is_flag=True, help="write the tables of what is there, and run nothing")
+@click.option("--plan", "only_plan", is_flag=True, help="list the steps to run, and stop")
+@click.option("--no-run", is_flag=True, help="write the tables of finished runs, and run nothing")
 @ON_DEVICE
 @ON
 def study(

@@ -102,12 +102,12 @@ def verify(scenes: tuple[str, ...]) -> int:
 @click.command("clean-stale")
 @click.option("--yes", is_flag=True, help="remove what is listed")
 @click.option(
-    "--keep-newer", type=Age(), default=0.0, help="spare what is younger: 30m, 12h, 7d, 4w"
+    "--keep-newer", type=Age(), default=0.0, help="keep what is younger: 30m, 12h, 7d, 4w"
 )
 @click.option(
     "--older-than",
     type=Age(),
-    help="give up scenes and studies, too, that nothing was added to for so long",
+    help="also remove scenes and studies without additions for so long",
 )
 def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
     """List the artifacts that no scene names any more, and leftovers of killed runs."""

@@ -46,7 +46,7 @@ def query(scene: str, text: str, against: list[str], top: int) -> None:
     "photos",
     type=click.Path(path_type=Path),
     multiple=True,
-    help="yours, or a folder: eight tell the usual mistakes; default: a view of a generated room",
+    help="a photo or folder; eight reveal the usual mistakes; default: a view of a generated room",
 )
 @click.option("--labels", help="text file of labels; default: the teacher's own")
 def check_teacher(model: Path, photos: tuple[Path, ...], labels: str | None) -> None:
@@ -90,9 +90,7 @@ def get_teacher(name: str, out: Path | None, graph: str) -> None:
 )
 @click.option("--min-opacity", type=click.FloatRange(0, 1), default=0.0, help="activated")
 @click.option("--box", help="x0,y0,z0,x1,y1,z1 that centres lie in, scene units")
-@click.option(
-    "--query", "text", help="words: what is likelier than not these, in parts that hang together"
-)
+@click.option("--query", "text", help="words: the connected Gaussians that are probably these")
 @AGAINST
 def extract(
     scene: str,
@@ -178,7 +176,7 @@ def calibrate(model: Path | None, rooms: int, force: bool) -> None:
 @click.option(
     "--words",
     type=Phrases(),
-    help="to choose among, with commas; default: the classes of generated rooms",
+    help="label set, with commas; default: the classes of generated rooms",
 )
 @click.option(
     "--up",
