@@ -72,8 +72,13 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     channels = None
     if teacher.output == "logits":
         labels = label_set(teacher, settings.labels, None) if settings.labels else None
-        space = closed_set(teacher, labels, n_channels, settings.n_channels)
         network.judge(capture.images)
+        shares = network.class_shares(capture.images, grid)
+        space = closed_set(teacher, labels, shares, settings.n_channels)
+        if space.left_out:
+            job.left_out(
+                "classes of outdoors", f"the views are of a room: {', '.join(space.left_out)}"
+            )
     else:
         if "channels" in job.inputs:
             channels = ChannelMap.read(job.inputs["channels"])
@@ -102,6 +107,7 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
         "channels": read_manifest(job.inputs["channels"]).key if channels else None,
         "teacher": [sha256_file(path) for path in teacher.files()],
         "labels": labels,
+        "names": space.names,
         "convention": convention,
     }
     shape = (*grid, space.embeddings.shape[1])

@@ -21,6 +21,7 @@ from chebsplat.stages.teacher_models.onnx_session import Model
 
 log = logging.getLogger("chebsplat")
 MAX_WINDOWS = 4096  # of a view
+SHARED = 8  # images that tell how common a segmenter's classes are
 JUDGED = 4  # images whose values tell what a segmenter gives
 MAX_SHARE = 0.5  # of the image's side that an entry of the map may be wide
 
@@ -147,6 +148,12 @@ class TeacherInference:
                 self.teacher.path.name,
                 self.scores,
             )
+
+    def class_shares(self, images: Stack | list[np.ndarray], grid: tuple[int, int]) -> np.ndarray:
+        """Mean probability [C] of a segmenter's classes in a few of the images."""
+        few = images[:: -(-len(images) // SHARED)]
+        maps = [self.features(image, grid, (1.0,), False, "a view") for image in few]
+        return np.asarray(np.mean([values.mean((0, 1)) for values in maps], 0))
 
     def middle(self, image: np.ndarray, side: tuple[int, int] | None = None) -> np.ndarray:
         """The window in an image's middle, u8 [H, W, 3]. Args: side: its (H, W); None: the

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ import numpy as np
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import read_label_set, read_label_table
 from chebsplat.labels.decode import class_codes, decode
-from chebsplat.labels.names import joined, lacking
+from chebsplat.labels.names import joined, lacking, rows_of
 from chebsplat.stages.teacher_models.text_encoder import text_embeddings
 
 if TYPE_CHECKING:
@@ -29,18 +29,30 @@ IN_ROOMS = (
     "book", "paper", "bottle", "cup", "bowl", "plate", "monitor", "television", "keyboard", "computer", "sink",
     "toilet", "bathtub", "shower", "oven", "refrigerator", "microwave", "radiator", "stairs", "person",
 )  # fmt: skip
+# classes of segmenters that no room holds: ADE20K's, and those of Cityscapes
+OUTDOORS = (
+    "airplane", "animal", "boat", "bridge", "building", "bus", "car", "dirt track", "earth", "fence", "field",
+    "fountain", "grandstand", "grass", "hill", "house", "hovel", "lake", "land", "motorcycle", "mountain", "path",
+    "pier", "river", "road", "rock", "sand", "sea", "ship", "sidewalk", "sky", "skyscraper", "streetlight", "tent",
+    "terrain", "tower", "traffic light", "traffic sign", "train", "tree", "truck", "van", "vegetation", "water",
+    "waterfall",
+)  # fmt: skip
+IN_A_ROOM = (
+    0.3  # of what a segmenter says, outdoor classes' share up to which its views are of a room
+)
 LEAST = 12  # of these words that a teacher knows, or else all of its own are asked for
 
 
 @dataclass
 class LabelSpace:
     """names [L]; embeddings f32 [L, d]; `split`: map [h, w, C] -> (features [h, w, d], labels,
-    confidence [h, w]).
+    confidence [h, w]); left_out: classes of the teacher that the scene does without.
     """
 
     names: list[str]
     embeddings: np.ndarray
     split: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+    left_out: Sequence[str] = ()
 
 
 def label_set(
@@ -107,24 +119,28 @@ def open_vocabulary(
 
 
 def closed_set(
-    teacher: TeacherModel, labels: dict[str, list[str]] | None, n_channels: int, n_codes: int
+    teacher: TeacherModel,
+    labels: dict[str, list[str]] | None,
+    shares: np.ndarray,
+    n_codes: int,
 ) -> LabelSpace:
-    """The space of a segmenter with `n_channels` classes.
+    """The space of a segmenter.
 
     Args: labels: where a file was asked for: classes that are words of one label become that label;
-      the others keep their own names.
+      the others keep their own names; shares [C]: of its classes in what it says of some views.
     Raises: InputError where names and channels differ in number, or a label has no class.
     Choices: a pixel's feature is the unit mean of the class codes (`chebsplat.labels.decode`),
       weighted by its probabilities, so that training is the same as for features; its label is the
-      likeliest, its confidence that probability.
+      likeliest, its confidence that probability. Where the views are of a room, OUTDOORS are left
+      out, but for those that `labels` names: what was taken for one becomes the next likeliest.
     """
     from chebsplat.stages.teacher_models.image_encoder import unit
 
     assert teacher.labels is not None  # `read_teacher` has seen to it
     classes = read_label_table(teacher.labels)[0]
-    if len(classes) != n_channels:
+    if len(classes) != len(shares):
         raise InputError(
-            f"{teacher.path} gives {n_channels} channels, {teacher.labels} names {len(classes)} "
+            f"{teacher.path} gives {len(shares)} channels, {teacher.labels} names {len(classes)} "
             "classes; name every "
             "channel in order"
         )
@@ -136,12 +152,17 @@ def closed_set(
             f"no class of {teacher.labels} is called {absent[0]} or one of its "
             "synonyms; correct the file"
         )
-    names = list(dict.fromkeys(named))
+    elsewhere = [row >= 0 and name not in (labels or {})
+                 for row, name in zip(rows_of(named, OUTDOORS), named, strict=True)]  # fmt: skip
+    in_a_room = float(shares[elsewhere].sum()) < IN_A_ROOM
+    left_out = [name for name, out in zip(named, elsewhere, strict=True) if out and in_a_room]
+    names = [name for name in dict.fromkeys(named) if name not in left_out]
     merge = np.array([[name == of for name in names] for of in named], np.float32)
     codes = class_codes(names, n_codes)
 
     def split(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        shares = maps @ merge
-        return unit(shares @ codes, -1), shares.argmax(-1).astype(np.int16), shares.max(-1)
+        of_names = maps @ merge
+        of_names /= of_names.sum(-1, keepdims=True).clip(1e-30)
+        return unit(of_names @ codes, -1), of_names.argmax(-1).astype(np.int16), of_names.max(-1)
 
-    return LabelSpace(names, codes, split)
+    return LabelSpace(names, codes, split, left_out)

@@ -327,8 +327,9 @@ def check(
     grid, n_channels = network.grid(image, settings.downscale)
     if teacher.output == "logits":
         asked = label_set(teacher, labels, None) if labels else None
-        space = closed_set(teacher, asked, n_channels, settings.n_channels)
         network.judge(images)
+        shares = network.class_shares(images, grid)
+        space = closed_set(teacher, asked, shares, settings.n_channels)
     else:
         space = open_vocabulary(teacher, label_set(teacher, labels, None), n_channels, None)
     began = time.perf_counter()
