@@ -152,8 +152,7 @@ def stages() -> dict[str, Action]:
 
 def take_turns(variants: dict[str, tuple[int, Action]], rounds: int) -> dict[str, float]:
     """Milliseconds of the fastest of `rounds` by name; variants are (threads, action). Each turn
-    begins with a run that
-    does not count: it fills the caches, and starts as many threads.
+    begins with a run that does not count: it fills the caches, and starts as many threads.
     """
     best = dict.fromkeys(variants, np.inf)
     for _ in range(rounds):

@@ -58,9 +58,8 @@ class SceneRenderer:
     on the CPU.
 
     Ks: [V, 3, 3] of the cameras that the scene was trained on. A view that is finer than all of
-      them is
-    blurred as much as theirs were, since what was trained under their blur is too thin without;
-    None: every view has the rasterizer's own blur.
+      them is blurred as much as theirs were, since what was trained under their blur is too thin
+      without; None: every view has the rasterizer's own blur.
     """
 
     def __init__(

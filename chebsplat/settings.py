@@ -2,9 +2,8 @@
 `stages/settings.py`.
 
 Values are part of an artifact's key; this code is not. Upper bounds lie where a machine of 64 GB or
-a day of computing
-ends, far beyond what helps a scene. Types are strict: 1.0 and true are no whole numbers, and no
-  number is infinite.
+a day of computing ends, far beyond what helps a scene. Types are strict: 1.0 and true are no whole
+numbers, and no number is infinite.
 """
 
 from __future__ import annotations

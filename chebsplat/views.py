@@ -129,8 +129,8 @@ class Window(NamedTuple):
 class Views:
     """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None, both as tensors or
     stored; features: view index -> [h, w, C]; labels: view index -> `TaughtLabels` of these h × w
-    cells, None where the teacher has none;
-    depth: view index and factor -> z-depths [H, W] at 1/factor, scene units, nan where unknown.
+    cells, None where the teacher has none; depth: view index and factor -> z-depths [H, W] at
+    1/factor, scene units, nan where unknown.
     """
 
     names: list[str]

@@ -2,11 +2,10 @@
 taught on, as a PLY.
 
 Every scene is trained as it comes (as `query` trains it), once a seed, and only its PLY, without
-features, is named as
-`chebsplat label` names it: told which way is up and what a metre is, shown no photo. The truth of a
-  Gaussian is what
-the true labels of all views say of it, lifted with the weights that it is rendered with. The houses
-need the test data (CHEBSPLAT_TEST_DATA), and are left out without it.
+features, is named as `chebsplat label` names it: told which way is up and what a metre is, shown no
+photo. The truth of a Gaussian is what the true labels of all views say of it, lifted with the
+weights that it is rendered with. The houses need the test data (CHEBSPLAT_TEST_DATA), and are left
+out without it.
 """
 
 from __future__ import annotations

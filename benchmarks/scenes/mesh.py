@@ -2,11 +2,9 @@
 voxels.
 
 Generated rooms know the depth of every pixel. Truth is every surface point that a view sees, one a
-centimetre; the mesh
-is measured at points drawn evenly from its area. Accuracy: median distance of the mesh to the
-  truth; completeness: of
-the truth to the mesh; F: harmonic mean of the shares within 2 and 5 cm; labels: of vertices within
-5 cm of the truth.
+centimetre; the mesh is measured at points drawn evenly from its area. Accuracy: median distance of
+the mesh to the truth; completeness: of the truth to the mesh; F: harmonic mean of the shares within
+2 and 5 cm; labels: of vertices within 5 cm of the truth.
 """
 
 from __future__ import annotations

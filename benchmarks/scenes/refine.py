@@ -1,9 +1,8 @@
 """Error against run time of what follows a training: the lift, smoothing, and knowledge of shape.
 
 mIoU is of rendered test views, beside the processor seconds that each form takes once kernels are
-compiled, all that it
-needs included: knowledge needs the lift, for its evidence, and smoothing. Figures and picture go to
-  `--out`.
+compiled, all that it needs included: knowledge needs the lift, for its evidence, and smoothing.
+Figures and picture go to `--out`.
 """
 
 from __future__ import annotations

@@ -2,9 +2,8 @@
 same files.
 
 Errors are in units of the photo's longer side. A folder with a `truth.json`, which maps a photo's
-stem to its
-camera-to-world matrix in metres, is held against it, too: medians of the angle and of the distance
-  after a similarity.
+stem to its camera-to-world matrix in metres, is held against it, too: medians of the angle and of
+the distance after a similarity.
 """
 
 from __future__ import annotations

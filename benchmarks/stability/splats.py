@@ -2,9 +2,8 @@
 planes, features.
 
 Errors are those of float32 on the CPU against float64 in plain torch or numpy. Of images and
-features it is the mean
-difference over the mean, of gradients that of norms: where float32 rounds an alpha across 1/255,
-  one pixel differs.
+features it is the mean difference over the mean, of gradients that of norms: where float32 rounds
+an alpha across 1/255, one pixel differs.
 """
 
 from __future__ import annotations

@@ -3,12 +3,10 @@ against seconds.
 
 Rooms are made once and kept (--rooms-in). Variants are taught alike, with each seed, have as many
 features, and answer by the map that the rooms' lessons give in closed form. A figure is the mIoU of
-a room's points that some view sees,
-averaged over the rooms held out and the seeds: of shape alone, where depth shows the room, where
-  few photos do, and
-where a sweep of its photos does; and of both, blended with the teacher's averages as in a scene
-whose training views ask for k = 2. In brackets the difference to pooling, with its 95 % interval
-over rooms.
+a room's points that some view sees, averaged over the rooms held out and the seeds: of shape alone,
+where depth shows the room, where few photos do, and where a sweep of its photos does; and of both,
+blended with the teacher's averages as in a scene whose training views ask for k = 2. In brackets
+the difference to pooling, with its 95 % interval over rooms.
 """
 
 from __future__ import annotations

@@ -4,9 +4,8 @@ a training.
 Every pair runs up to the stage `agree`, whose figure knows no true labels. Beside it stands the
 mIoU of the teacher's own label maps against the true labels of all views, over the classes that
 occur in either. Teachers: the embedded one, which has seen generated rooms and not the houses, and
-  the source's labels with a share of the segments confused.
-The houses need the test data (CHEBSPLAT_TEST_DATA), and are left out with a line where it is not
-there.
+the source's labels with a share of the segments confused. The houses need the test data
+(CHEBSPLAT_TEST_DATA), and are left out with a line where it is not there.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ The trainings take turns of fifty steps, so that other load on the machine meets
 training of each goes before, so that no kernel is left to compile.
 
 Of growth, each case is a process of its own: some steps of the default training, colour and depth
-  loss, on views of the
-scene that are enlarged and repeated, from as many points of its depth as Gaussians are wanted.
-Exponents are slopes of logarithms between the first and the last case of a row.
+loss, on views of the scene that are enlarged and repeated, from as many points of its depth as
+Gaussians are wanted. Exponents are slopes of logarithms between the first and the last case of a
+row.
 """
 
 from __future__ import annotations
@@ -68,8 +68,7 @@ def trainer_from(work: Path, config: Config, backend: str = "auto", device: str 
     teacher.
 
     Args: work: folder of the links `ingest`, `sfm` and, if semantics are trained, `teacher`;
-      backend: of the
-          rasterizer; device: `cpu` or `cuda`.
+      backend: of the rasterizer; device: `cpu` or `cuda`.
     """
     inputs = {"capture": work / "ingest", "points": work / "sfm"}
     job = job_of(

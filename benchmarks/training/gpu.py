@@ -1,12 +1,11 @@
 """office0 trained on a GPU, beside the CPU and beside plain 3DGS through gsplat.
 
 Rows of gpu.csv: a training each, with its seconds, PSNR and mIoU on the test views, and the most
-  memory that tensors
-have taken until then; frames a second of our scene by this project's renderer and of plain 3DGS by
-gsplat's own, by turns, the images copied back. Then the launches of a step, by the profiler; one
-step of scenes of 20,000, 200,000 and 1,000,000 Gaussians, ours, and gsplat's own with and without
-packing; one of large photos; and a short training twice: gsplat adds gradients up in the order in
-which threads arrive.
+memory that tensors have taken until then; frames a second of our scene by this project's renderer
+and of plain 3DGS by gsplat's own, by turns, the images copied back. Then the launches of a step, by
+the profiler; one step of scenes of 20,000, 200,000 and 1,000,000 Gaussians, ours, and gsplat's own
+with and without packing; one of large photos; and a short training twice: gsplat adds gradients up
+in the order in which threads arrive.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 numba's loops vectorise only when LLVM proves that nothing aliases; these say it. LLVM splits a
 vector wider than the machine's registers, so the same source runs on AVX-512 (one register), AVX2
 (two), SSE and NEON (four); only a machine without fused multiply-add rounds differently. An array
-argument is contiguous float32, its index counts elements and
-is not checked: the callers lay out every buffer that they pass.
+argument is contiguous float32, its index counts elements and is not checked: the callers lay out
+every buffer that they pass.
 """
 
 from __future__ import annotations

@@ -101,15 +101,11 @@ def between(first: np.ndarray, second: np.ndarray, n_labels: int) -> Agreement:
 
     Args: first, second: i64 [M], labels in 0...n_labels-1 that the two views of each point say.
     Choices: a label's IoU of points (both say it / either does) rises with the mIoU that is wanted,
-      of which it is the
-      label-free counterpart, and is as balanced over labels: a teacher that calls everything wall
-        has nothing to
-      disagree on, and one label. Two views that say a label independently, with its share p, have
-      an IoU of
-      p / (2 - p): 0 on the scale of (IoU - chance) / (1 - chance), so that the label that is
-        everywhere counts nothing.
-      Where a single label is said its chance is 1, and its agreement 0. The two views of a point
-      are exchangeable.
+      of which it is the label-free counterpart, and is as balanced over labels: a teacher that
+      calls everything wall has nothing to disagree on, and one label. Two views that say a label
+      independently, with its share p, have an IoU of p / (2 - p): 0 on the scale of (IoU - chance)
+      / (1 - chance), so that the label that is everywhere counts nothing. Where a single label is
+      said its chance is 1, and its agreement 0. The two views of a point are exchangeable.
     Source: Cohen's correction for chance (1960), of the IoU.
     """
     counts = np.bincount(first * n_labels + second, minlength=n_labels**2).reshape(

@@ -53,15 +53,12 @@ def channel_map(
     Raises: ValueError if there are no features, or all are zero.
     Choices: eigenvectors of second moments, not of covariances, since an inner product with a word
       counts from zero. The vocabulary counts by its scatter about its mean, which is all that a
-      choice between words depends on. Its
-      weight of 1 was chosen among 0, .1, .3, 1, 3 and 10: with 32 of 512 channels (spectra as k^-1
-        and k^-2, words of
-      mean cosine .76) it keeps 93 % of the decisions between 150 words, energy alone 83 %, at a
-      relative error of 24 instead of 22 %; more weight gains nothing. It counts only within the
-      directions that the features span (all
+      choice between words depends on. Its weight of 1 was chosen among 0, .1, .3, 1, 3 and 10: with
+      32 of 512 channels (spectra as k^-1 and k^-2, words of mean cosine .76) it keeps 93 % of the
+      decisions between 150 words, energy alone 83 %, at a relative error of 24 instead of 22 %;
+      more weight gains nothing. It counts only within the directions that the features span (all
       but NEGLIGIBLE of their energy): so a teacher of rank n_channels or less comes through
-        exactly. Signs: the largest
-      entry of a column is positive.
+      exactly. Signs: the largest entry of a column is positive.
     """
     total = np.trace(moments.products)
     if not total > 0:

@@ -26,8 +26,7 @@ def confusable(colors: np.ndarray, width: float = 0.15) -> np.ndarray:
     to 1 or 0.
 
     Choices: a Gaussian of the colour distance, `width` in units of full intensity, plus 1e-6 so
-      that every class
-    that occurs has somebody to be taken for.
+      that every class that occurs has somebody to be taken for.
     """
     distance = np.linalg.norm(colors[:, None] - colors[None], axis=-1)
     weights = np.where(np.isfinite(distance), np.exp(-0.5 * (distance / width) ** 2) + 1e-6, 0.0)

@@ -92,14 +92,13 @@ def familiar(lifted: np.ndarray, knowledge: np.ndarray, embeddings: np.ndarray) 
     where shape is by c'.
 
     Args: lifted [N, C], what the views say of Gaussians, zero where none sees one; knowledge [N,
-      C]; embeddings [L, C]
-          of the scene's labels.
+      C]; embeddings [L, C] of the scene's labels.
     Returns: in (0, 1]; 1 where no view sees a Gaussian.
     Choices: c and c' are mean confidences of `decode`. Views that agree may agree in what none of
       them knows: a teacher shown a world that it was not taught is between labels, wherever it
-        looks from. Of a scene, not of a Gaussian:
-      small things have no sure label in either, and are the views' to tell. Gaussians that no view
-      sees are not asked: few photos leave many, which says nothing of the teacher.
+      looks from. Of a scene, not of a Gaussian: small things have no sure label in either, and are
+      the views' to tell. Gaussians that no view sees are not asked: few photos leave many, which
+      says nothing of the teacher.
     """
     seen = lifted.any(1)
     if not seen.any():
@@ -119,10 +118,8 @@ def believed(
 
     Args: as for `familiar`; n_views [N] that see each Gaussian; worth: of `familiar`.
     Choices: where a teacher knows the scene and many labels of shape, weighed by how sure it is of
-      them, are not
-      its own, it is shape that is wrong: another world than it was taught in. Below BELIEVED it has
-        no say, above it
-      all. A teacher that is unsure of the scene is no judge.
+      them, are not its own, it is shape that is wrong: another world than it was taught in. Below
+      BELIEVED it has no say, above it all. A teacher that is unsure of the scene is no judge.
     """
     seen = (n_views >= 2) & lifted.any(1)
     if not seen.any():
@@ -154,18 +151,16 @@ def calibrate(
     with the other half.
 
     Args: halves [2, N, C], features by each half of the training views; half_views [2, N] how many
-      of them see each;
-          near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing is decided.
+      of them see each; near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing
+      is decided.
     Returns: whether smoothing alone makes the halves agree better, and the strength at which they
       agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up. Agreement is the
       cosine between what is made of one half (smoothed, blended by its own views) and the other
       half's mean features, averaged over the Gaussians that both see, by the other half's views,
       both ways alike.
     Choices: no test view is looked at, and no label. On ties, and without a Gaussian that both
-      halves see, what changes
-      less wins. The strength is that for features as they are: what smoothing has made of a half is
-        no longer evidence
-      of its views alone, and asks for less.
+      halves see, what changes less wins. The strength is that for features as they are: what
+      smoothing has made of a half is no longer evidence of its views alone, and asks for less.
     """
     strengths, reliability = (
         STRENGTHS if knowledge is not None else STRENGTHS[:1],

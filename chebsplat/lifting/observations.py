@@ -90,8 +90,7 @@ def estimate(
 
     Args:
       median_steps: of Weiszfeld's, from the weighted mean towards the geometric median of the
-        views' directions
-                    b / |b|; 0: the mean.
+        views' directions b / |b|; 0: the mean.
       min_weight:   pixels; a view of less is not counted in n_views.
     Choices: the result is Σ f b / Σ f with f > 0, so that it never leaves the cone of what views
       said, as the exact least-squares solution does. Chords below NEAREST count as NEAREST: no
@@ -137,8 +136,7 @@ def carry(
     normal.
 
     Args: values [P, C] at points [P, 3], scene units, with point_normals [P, 3]; means [N, 3] with
-      normals [N, 3]; all
-          normals unit, of any sign; unit: scene units of a metre, > 0.
+      normals [N, 3]; all normals unit, of any sign; unit: scene units of a metre, > 0.
     Returns: f32 [N, C], and the distance to the nearest point in scene units, f32 [N], for who
       trusts near points only.
     Raises:  ValueError without points.

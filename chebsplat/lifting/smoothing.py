@@ -38,10 +38,8 @@ def room_unit(means: np.ndarray) -> float:
     scale.
 
     Choices: the median distance from the middle is taken for HALF_EXTENT, of those that lie as
-      close together as a room
-      is filled: a background far away does not count, be it most of them. 1 where all Gaussians
-        coincide. In generated
-      rooms of 3.4 to 7 m it lies between 0.8 and 1.3.
+      close together as a room is filled: a background far away does not count, be it most of them.
+      1 where all Gaussians coincide. In generated rooms of 3.4 to 7 m it lies between 0.8 and 1.3.
     """
     some = means[:: max(-(-len(means) // SAMPLED), 1)]
     spacing = (

@@ -52,11 +52,10 @@ def surface(
     """Points of the surface, at most one in a cube of edge EDGE.
 
     Args: parameters: raw, of N Gaussians; cam_from_world [V, 4, 4] and Ks [V, 3, 3] of views of
-      `size` (width, height);
-          unit: scene units of a metre; n_pixels: that are looked at, of all views alike, drawn.
+      `size` (width, height); unit: scene units of a metre; n_pixels: that are looked at, of all
+      views alike, drawn.
     Choices: depth as `render_depth` has it; points averaged by cube. How many pixels a cube needs
-      follows from how many
-      others hold: in a wide room, or of few pixels, all hold fewer.
+      follows from how many others hold: in a wide room, or of few pixels, all hold fewer.
     """
     renderer, (width, height) = SceneRenderer(dict(parameters)), size
     rng, count = np.random.default_rng(0), min(max(n_pixels // max(len(Ks), 1), 1), width * height)

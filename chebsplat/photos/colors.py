@@ -11,8 +11,7 @@ def tell_of(colors: np.ndarray, pixels: np.ndarray) -> bool:
 
     Choices: by mean distance, with the pixels' median for the one colour: what is all black, all of
       one colour, drawn at random or written in other units tells nothing, and needs no list of such
-      cases. Of no points, or of pixels
-      that are all alike, nothing can be told: yes.
+      cases. Of no points, or of pixels that are all alike, nothing can be told: yes.
     """
     if not len(pixels):
         return True

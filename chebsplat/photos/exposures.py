@@ -53,12 +53,11 @@ def measured_exposures(
     """Exposures [V, 3] of V photos of the same points; NaN of those that show too few of them.
 
     Args: images: u8 [H, W, 3] of V views; Ks [V, 3, 3] pixels; cam_from_world [V, 4, 4]; points [N,
-      3]; tracks: int
-      [T, 2] (point, view), or None: points are seen by all views that have them within their frame.
+      3]; tracks: int [T, 2] (point, view), or None: points are seen by all views that have them
+      within their frame.
     Choices: light is that of a point times its view's exposure. Both are medians, by turns, so that
-      walls in between
-      and highlights count little. Of many points, some: with tracks as many as are seen MOST times
-        in all.
+      walls in between and highlights count little. Of many points, some: with tracks as many as are
+      seen MOST times in all.
     """
     n_views = len(Ks)
     wanted = (

@@ -30,11 +30,9 @@ def along_lines(
       3, 3]: of each.
     Choices: mutual nearest descriptors within BAND, by Lowe's ratio among those that lie there: the
       line leaves a hundredth of the features, so this is faster than a search of all of them, and
-      finds what repeats elsewhere, too.
-      Chance finds a match among so few more easily: RATIO and ALIKE are stricter than usual, and
-        leave a tenth of such
-      (of fox's matches, with lines moved by 12 pixels across). Where F is 0, as for two views from
-      one place, no feature has a line.
+      finds what repeats elsewhere, too. Chance finds a match among so few more easily: RATIO and
+      ALIKE are stricter than usual, and leave a tenth of such (of fox's matches, with lines moved
+      by 12 pixels across). Where F is 0, as for two views from one place, no feature has a line.
     """
     kept = [_by_strips(at) for at in pixels]
     start = np.cumsum([0, *map(len, pixels)])

@@ -116,9 +116,8 @@ def agreed(
     elsewhere.
 
     Args: depth [V, h, w], 0 where none is known; Ks [V, 3, 3] in its pixels; cam_from_world [V, 4,
-      4];
-          others i64 [V, M]: the views that each is compared with, -1: none; least: of them that
-            must confirm a pixel.
+      4]; others i64 [V, M]: the views that each is compared with, -1: none; least: of them that
+      must confirm a pixel.
     Choices: a view denies a point where it sees farther than that: nothing can be there. What a
       view sees before a point hides it, and says nothing.
     """

@@ -2,9 +2,8 @@
 
 A Gaussian touches a tile through one *pair*. Pairs are numbered by band of tile rows, then Gaussian
 by Gaussian: the gradient records that a Gaussian collects in a band lie together and are summed in
-  a fixed order. No atomics, the same
-bits for any number of threads, and records for one band at a time. Work is dealt out in PARTS,
-whatever the threads.
+a fixed order. No atomics, the same bits for any number of threads, and records for one band at a
+time. Work is dealt out in PARTS, whatever the threads.
 """
 
 from __future__ import annotations

@@ -3,9 +3,8 @@
 At an offset d from a Gaussian's mean, (u, v) = W d and log₂ α = log₂ opacity − u² − v², with W =
 [[p, q], [0, r]] (see `ellipses`). A tile holds 16 cells and, for each of its Gaussians, a row of
 `shapes`: p, q, r, then u and v at the middle of the tile, log₂ opacity, and from SHAPE on the
-  channels. Sweeping a cell lists the Gaussians that contribute to
-it, with α and the weight α T by lane; what remains are products of small dense matrices, whose sums
-stay in registers.
+channels. Sweeping a cell lists the Gaussians that contribute to it, with α and the weight α T by
+lane; what remains are products of small dense matrices, whose sums stay in registers.
 """
 
 from __future__ import annotations

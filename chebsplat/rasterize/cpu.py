@@ -19,9 +19,8 @@ class _Project(torch.autograd.Function):
     gradient.
 
     What comes back for `covariances`, which stay between the two Functions, is not their gradient
-    but the whitened
-    moments that `ellipses.project_adjoint` takes: they keep the precision that the gradient would
-      lose.
+    but the whitened moments that `ellipses.project_adjoint` takes: they keep the precision that the
+    gradient would lose.
     """
 
     @staticmethod

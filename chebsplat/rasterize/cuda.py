@@ -45,14 +45,11 @@ def rasterize(
     Choices: gsplat fixes the ceiling of alpha at 0.999; a lower one is kept by what a Gaussian's
       opacity is at most, so that no alpha exceeds it. Renders are those of the other backends where
       no opacity is above `max_alpha`; where one is, alpha is the same at its middle and lower by up
-      to a hundredth around it. The gradient passes as
-      if there were no ceiling: a Gaussian that has reached it can become fainter again. What lies
-        in the near plane
-      is cut, as elsewhere. Covariances are float32: a needle a billion times as long as wide is
-        drawn wider than it
-      is. All channels go at once: of gsplat's chunks only one would leave its absolute gradient. A
-        broken Gaussian is
-      replaced by one that nobody sees, because gsplat would draw a NaN opaque.
+      to a hundredth around it. The gradient passes as if there were no ceiling: a Gaussian that has
+      reached it can become fainter again. What lies in the near plane is cut, as elsewhere.
+      Covariances are float32: a needle a billion times as long as wide is drawn wider than it is.
+      All channels go at once: of gsplat's chunks only one would leave its absolute gradient. A
+      broken Gaussian is replaced by one that nobody sees, because gsplat would draw a NaN opaque.
     """
     is_antialiased(rasterize_mode)
     if means.dtype != torch.float32 or means.device.type != "cuda":
@@ -113,9 +110,8 @@ def made_harmless(
     quaternions scaled.
 
     Choices: a Gaussian's values are looked at together, by their sum, which is finite where each of
-      them is (or takes
-      one for broken whose values are beyond all measure): each question to a GPU takes as long as a
-        sum.
+      them is (or takes one for broken whose values are beyond all measure): each question to a GPU
+      takes as long as a sum.
     """
     opacities = opacities + (opacities.clamp_max(max_alpha) - opacities).detach()
     by_camera = colors.ndim == 3

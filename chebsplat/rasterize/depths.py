@@ -2,9 +2,8 @@
 made of.
 
 Gaussians of a wall overlap in depth and each covers little, so the first ones that a ray meets
-already take part of its
-weight: the mean over all lies in front of the wall. The surface is where most of the light has been
-  gathered.
+already take part of its weight: the mean over all lies in front of the wall. The surface is where
+most of the light has been gathered.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@ float64 inside.
 
 Beside mean and covariance each Gaussian gets its whitening W = [[p, q], [0, r]], WᵀW = ½ log₂e Σ⁻¹,
 so that at an offset d from the mean log₂ α = log₂ opacity − |W d|². W comes from the determinant by
-Cauchy-Binet, which cannot
-cancel, and gradients are gathered in W d: a needle's are as exact as a ball's.
+Cauchy-Binet, which cannot cancel, and gradients are gathered in W d: a needle's are as exact as a
+ball's.
 """
 
 from __future__ import annotations

@@ -60,9 +60,8 @@ def project(
     Args: see `rasterize`; `viewmat` [4, 4], `K` [3, 3]; size: width and height; bounds: near and
       far plane.
     Choices: culled by `not (near < z < far)`, which rejects NaN too; the view ray's slope is
-      clamped to 1.3 times the
-    field of view in the Jacobian, as gsplat does; a zero quaternion or a non-finite result is
-    culled, never repaired.
+      clamped to 1.3 times the field of view in the Jacobian, as gsplat does; a zero quaternion or a
+      non-finite result is culled, never repaired.
     """
     (width, height), (near_plane, far_plane) = size, bounds
     camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]

@@ -5,9 +5,8 @@ all its cells at once, in chunks until every pixel is done, then sweeps cell by 
 repeats the sweep, so that only the cells' bit masks are kept between the two.
 
 Channels come in two kinds: `colors` by pixel, and `cell_colors`, of which only the mean over each
-  cell of 4×4 pixels is
-rendered. A Gaussian's part in that mean is the sum of its 16 weights, so a cell channel costs a
-sixteenth of the products of the other kind, forward and backward.
+cell of 4×4 pixels is rendered. A Gaussian's part in that mean is the sum of its 16 weights, so a
+cell channel costs a sixteenth of the products of the other kind, forward and backward.
 """
 
 from __future__ import annotations

@@ -58,8 +58,7 @@ def metric_factors(region: Region, anisotropy: float) -> Tensor:
 
     Returns: [M, n, 3, 3].
     Choices: s̃ is the region's median largest scale, so that anisotropy does not fade with the
-      scene's units; a region
-    whose s̃ is 0 is isotropic wherever its scales are 0.
+      scene's units; a region whose s̃ is 0 is isotropic wherever its scales are 0.
     """
     largest = region.scales.amax(-1)
     typical = (
@@ -81,8 +80,8 @@ def tangent_axis(region: Region) -> tuple[Tensor, Tensor]:
     """The axis of least variance of the region's Gaussian mixture, and how well it is defined.
 
     Returns: axis [M, 3], of arbitrary sign; certainty [M], a smoothstep of the gap of the two
-      smallest variances.
-      Neither has a gradient: that of an eigenvector does not exist where eigenvalues meet.
+      smallest variances. Neither has a gradient: that of an eigenvector does not exist where
+      eigenvalues meet.
     """
     widest = region.scales.amax((1, 2), keepdim=True).clamp_min(1.0)
     spread = region.rotmats * (region.scales / widest)[..., None, :]
@@ -123,9 +122,8 @@ def similarity(region: Region, factors: Tensor, rotmats: Tensor, bandwidth: floa
       rotmats: [M, 3, 3], the rotation of every metric of a region.
     Returns: [M, n, n], zero diagonal, zero rows for padding.
     Choices: degrees by logsumexp and one exponential of a difference of logarithms: a region all of
-      whose weights
-    underflow still has the right operator. Differences are formed directly, never by the expanded
-    square.
+      whose weights underflow still has the right operator. Differences are formed directly, never
+      by the expanded square.
     """
     delta = region.means[:, :, None] - region.means[:, None]
     turned = torch.einsum("mpqk,mkl->mpql", delta, rotmats)  # (rotmatᵀ Δ) in rows

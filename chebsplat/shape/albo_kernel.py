@@ -6,8 +6,7 @@ off ±1, where T_d multiplies rounding errors by d² rather than by d.
 
 Matrices are [n, n] stored flat, where n is the member count filled up to a multiple of 16. All are
 symmetric: what fills one fills the blocks on and above the diagonal and mirrors them. Sums are
-  carried out as written: no function here
-may be compiled with reassociation.
+carried out as written: no function here may be compiled with reassociation.
 """
 
 from __future__ import annotations

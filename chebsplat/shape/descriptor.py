@@ -1,8 +1,7 @@
 """Chebyshev descriptors of regions of Gaussians (Eqs 4-6).
 
 Two backends agree to float32: `numba` is compiled, `reference` (torch) differentiable. Torch is
-  imported where it is
-needed only: finished scenes are described without it.
+imported where it is needed only: finished scenes are described without it.
 """
 
 from __future__ import annotations
@@ -40,8 +39,7 @@ def describe(
       means, scales, rotmats, mask: [M, n, ...], as `albo.canonicalize`.
       dtype:   of the result, float32 if None; float64 by the reference only.
       backend: `numba` (float32, no gradient; the same bits for any number of threads), `reference`,
-        or
-        `auto`: numba where it can.
+        or `auto`: numba where it can.
     Returns: values [M, n, J, P], zero where padded and in regions of fewer than two Gaussians,
       which have no edge. Of the full spectrum it is the printed formula with K = n and λ_max = 2,
       without degrees 0 and 1, which vanish.

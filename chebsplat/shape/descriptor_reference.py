@@ -21,8 +21,8 @@ def chebyshev_diagonals(S: Tensor, max_degree: int) -> Tensor:
     Args: S [..., n, n] symmetric, spectrum within [-1, 1], zero diagonal.
     Returns: [..., n, max_degree - 1].
     Choices: E_m = T_m − T_m(0) I is carried, so nothing of size 1 is ever subtracted; the diagonals
-      of T_2m and
-    T_2m+1 are row products of T_m and T_m+1, so max_degree 8 costs three matrix products.
+      of T_2m and T_2m+1 are row products of T_m and T_m+1, so max_degree 8 costs three matrix
+      products.
     """
     x = -S
     terms = [torch.zeros_like(x), x]
@@ -52,9 +52,8 @@ def describe(
     float64.
 
     Choices: angles j and J − j are replaced by half their sum and half their absolute difference,
-      so that the sign of
-    the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis
-    has no gradient.
+      so that the sign of the axis does not matter; angles j > 0 fade to angle 0 where the axis is
+      ill-defined; the axis has no gradient.
     """
     region, n_angles = canonicalize(means, scales, rotmats, mask), wanted.n_angles
     factors = metric_factors(region, wanted.anisotropy)

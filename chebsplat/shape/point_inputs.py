@@ -30,9 +30,8 @@ class PointInputs(NamedTuple):
     """Of N points, in metres, z up; S radii.
 
     own:         f32 [N, 6]: height above the floor; normal · up and its size; standard deviations
-      along the least and
-                 the middle axis of the local covariance over that along the largest; logarithm of
-                 that.
+      along the least and the middle axis of the local covariance over that along the largest;
+      logarithm of that.
     means:       f32 [N, 3] about their centroid; normals: f32 [N, 3].
     descriptors: f32 [N, S J P], of the point itself in a region about it, by radius.
     neighbors:   i32 [N, S, K] rows of points, -1 where a radius holds fewer.
@@ -67,11 +66,9 @@ def point_inputs(
     Raises: ValueError on values that are not finite, or no unit at all.
     Choices: a neighbourhood of radius r is of points of which a cube of edge 0.36 r keeps one, so
       that K of them reach as far as r however dense the cloud is; the nearest K to 1.3 r are taken.
-      Descriptors are of the point itself in
-      the region of its 31 nearest of these: Eq 9 is exact at a region's centre. Covariances only
-        shape the metric and
-      three ratios, so that their scale must be that of the spacing
-      (`splats.gaussians.local_shape`).
+      Descriptors are of the point itself in the region of its 31 nearest of these: Eq 9 is exact at
+      a region's centre. Covariances only shape the metric and three ratios, so that their scale
+      must be that of the spacing (`splats.gaussians.local_shape`).
     """
     if not unit > 0 or not all(np.isfinite(v).all() for v in (means, normals, covariances, up)):
         raise ValueError(

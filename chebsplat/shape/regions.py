@@ -15,10 +15,9 @@ SAMPLE = 65536  # points that stand for all where only a density is wanted
 
 class Regions(NamedTuple):
     """centers i64 [M] are indices of points, in farthest-point order; members i64 [M, n], -1 where
-    padded, the centre
-    first. radius: scene units; no member is farther from its centre, and it is at least the
-      centres' covering
-    radius. share: the part of all points that members were taken from.
+    padded, the centre first. radius: scene units; no member is farther from its centre, and it is
+    at least the centres' covering radius. share: the part of all points that members were taken
+    from.
     """
 
     centers: np.ndarray
@@ -62,8 +61,8 @@ def farthest_points(means: np.ndarray, count: int, start: int) -> tuple[np.ndarr
     """Indices [M] of points, each the farthest from those before it, and their covering radius.
 
     Choices: M < count where only coincident points are left. Exact in float32 around the centroid.
-      `start` is an
-    index in the library's own order of the points: it seeds the first pick without naming it.
+      `start` is an index in the library's own order of the points: it seeds the first pick without
+      naming it.
     """
     n = len(means)
     if n == 1:

@@ -99,11 +99,10 @@ def walk(size: tuple[float, float, float], n_views: int, seed: int) -> np.ndarra
 
     Choices: two rounds, the second lower, closer and turned the other way; the gaze crosses the
       room, swings by ±49° and nods twice a round between 26° down and 4° up, so every surface is
-      met from several sides. Few views make
-      one round with half the swing and one nod: neighbours would share too little otherwise. No eye
-        is below 1.47 m,
-      which clears the chairs (1.05 m at most) by 0.4 m; what is taller stands at a wall. In 200
-      shuffled rooms nothing comes nearer than 0.38 m.
+      met from several sides. Few views make one round with half the swing and one nod: neighbours
+      would share too little otherwise. No eye is below 1.47 m, which clears the chairs (1.05 m at
+      most) by 0.4 m; what is taller stands at a wall. In 200 shuffled rooms nothing comes nearer
+      than 0.38 m.
     """
     rng = np.random.default_rng([seed, 1])
     phase = rng.uniform(0, 2 * np.pi)

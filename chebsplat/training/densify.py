@@ -19,9 +19,8 @@ SHRINK = 1.6  # 3DGS's divisor of the scales of two Gaussians that replace one
 
 class Additions(NamedTuple):
     """parents i64 [A]: whom each new Gaussian comes from. rows: raw parameters [A, ...] of the new
-    ones.
-    changed: raw parameters [A, ...] that the parents take on, by name (a parent occurs once at
-      most).
+    ones. changed: raw parameters [A, ...] that the parents take on, by name (a parent occurs once
+    at most).
     """
 
     parents: Tensor
@@ -124,8 +123,8 @@ def _places(
     candidates: Candidates,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places [A, 3] of new Gaussians in regions of members [R, n] (-1 where padded), steepest
-    first, and the Gaussians
-    [A] that they come from. Args: excess [R]: of the gradient over the threshold.
+    first, and the Gaussians [A] that they come from. Args: excess [R]: of the gradient over the
+    threshold.
     """
     tree = cKDTree(means)
     centers, radii, spacings = _balls(tree, means, inside)

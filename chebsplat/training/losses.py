@@ -182,10 +182,9 @@ def feature_distance(
     """Mean distance to the teacher's features at the teacher's resolution.
 
     Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts, or
-      float ≥ 0, how
-      much it does. kind: `length` of the difference over √C, or `l1`, its mean magnitude by
-        channel; counted [h, w]
-      bool: cells of the target that say something, None: all do; backend: of `rasterize`.
+      float ≥ 0, how much it does. kind: `length` of the difference over √C, or `l1`, its mean
+      magnitude by channel; counted [h, w] bool: cells of the target that say something, None: all
+      do; backend: of `rasterize`.
     Choices: the render is averaged over each cell of the target; a cell counts by the mean of its
       pixels' mask. Where views disagree about a Gaussian the shortest total length is at their
       geometric median, which lies near the most common vector; the median channel by channel, where
@@ -233,8 +232,7 @@ def semantic_loss(
     label cost nothing.
 
     Args: features [h, w, C] and labels of the teacher; mask [H, W], true where a pixel counts, or
-      None;
-      backend: of `rasterize`.
+      None; backend: of `rasterize`.
     Raises: ValueError where cross-entropy is asked for without labels.
     """
     if settings.feature_loss == "cross-entropy":
@@ -257,9 +255,8 @@ def label_entropy(
       h × w cells, h ≤ H; mask [H, W], as of `feature_distance`.
     Returns: the mean over cells that have a label, 0 where none has one.
     Choices: the render is averaged over each cell, as in `feature_distance`. The mean is over
-      cells, not over
-      confidences: a view of which the teacher is unsure teaches less than another, as in Panoptic
-        Lifting.
+      cells, not over confidences: a view of which the teacher is unsure teaches less than another,
+      as in Panoptic Lifting.
     """
     size = (labels.classes.shape[0], labels.classes.shape[1])
     pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)

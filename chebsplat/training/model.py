@@ -40,9 +40,8 @@ class Auxiliary:
     """What losses need beside the picture; None where it was not wanted or does not exist.
 
     soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]; in_view bool [V], None: all are. Of
-      the printed method:
-    soft_mask [N] and delta [N, 4] of all Gaussians, fused features [V, C], and L_reg []
-    (`knowledge`).
+      the printed method: soft_mask [N] and delta [N, 4] of all Gaussians, fused features [V, C],
+      and L_reg [] (`knowledge`).
     """
 
     soft_mask: Tensor | None = None
@@ -56,10 +55,8 @@ class Auxiliary:
 @dataclass
 class Rendered:
     """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C], [h, w, C] by cell of the rasterizer, or
-    None; `index` [V]
-    the Gaussians in the frustum, None: all, with `means2d` [1, V, 2] and `radii` [1, V] in `meta`;
-      planes [H, W, 3],
-    Σ w_i q_i of `planes_in_view`, 1 / scene unit, or None.
+    None; `index` [V] the Gaussians in the frustum, None: all, with `means2d` [1, V, 2] and `radii`
+    [1, V] in `meta`; planes [H, W, 3], Σ w_i q_i of `planes_in_view`, 1 / scene unit, or None.
     """
 
     rgb: Tensor
@@ -79,10 +76,8 @@ class SceneModel:
     trainer freezes them.
 
     Args: raw: of `splats.gaussians.initial_gaussians`, with SH bands or without, on the device that
-      is to compute;
-      n_channels: of the features, None without semantics; backend: of `rasterize`, and of all else
-        in a step that has
-      a compiled kernel.
+      is to compute; n_channels: of the features, None without semantics; backend: of `rasterize`,
+      and of all else in a step that has a compiled kernel.
     """
 
     def __init__(
@@ -199,8 +194,8 @@ class SceneModel:
         """Colour and features in one pass.
 
         degree: SH bands in use; masked: apply the pruning masks; semantic: render features too;
-          grid: features are
-        only wanted as means over h × w cells, and rendered so where these are the rasterizer's;
+          grid: features are only wanted as means over h × w cells, and rendered so where these are
+          the rasterizer's;
         depth: render it too, three channels beside the colours.
         Choices: on a GPU all Gaussians are rendered, since to choose those in view is to wait for
           their number.

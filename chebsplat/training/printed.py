@@ -75,9 +75,8 @@ class PrintedScene(SceneModel):
     """A `SceneModel` by the print: `sh_logits` are [N, 4], and fused features go into everything.
 
     bases: B of each key projection matrix, by name, of the scenes before; empty: none. Regions,
-      descriptors and
-    weights of Eq 8 are those of the Gaussians as they are at a step, without gradient to means and
-    covariances.
+      descriptors and weights of Eq 8 are those of the Gaussians as they are at a step, without
+      gradient to means and covariances.
     """
 
     def __init__(

@@ -12,9 +12,8 @@ class SemanticGate(nn.Module):
     """Pruning logit [N] from semantic features [N, C]; starts open, alike for all.
 
     Choices: starts at logit 1, m̂ = 0.73, with `prune_logits` at 1 too: from 3 a short training's λ
-      does not get any
-      mask below the threshold. The caller detaches the features: they are taught by the teacher,
-        not by pruning.
+      does not get any mask below the threshold. The caller detaches the features: they are taught
+      by the teacher, not by pruning.
     """
 
     def __init__(self, n_channels: int, initial: float = 1.0):

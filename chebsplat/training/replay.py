@@ -29,11 +29,10 @@ class Replay:
 
     A small scene's step is hundreds of small operations, which take longer to launch than to
     compute. A recording holds for the same `key` and tensors of the same shapes, and all of them
-    for the same
-    leaves: after growth and pruning they are made again. A first call is not recorded, so that
-    libraries have prepared what they need, nor is one without gradients. Where torch or the driver
-    cannot record, a warning says so, and `records` becomes false: then nothing is.
-    Results of a recording are overwritten by its next replay.
+    for the same leaves: after growth and pruning they are made again. A first call is not recorded,
+    so that libraries have prepared what they need, nor is one without gradients. Where torch or the
+    driver cannot record, a warning says so, and `records` becomes false: then nothing is. Results
+    of a recording are overwritten by its next replay.
     """
 
     def __init__(self, records: bool):

@@ -72,8 +72,7 @@ class Schedule:
     """Of a resolved train section, and photos whose longer side has `side` pixels.
 
     A budget is a number of steps, or seconds of training: then the pace is the machine's, and no
-      two
-    runs are the same.
+    two runs are the same.
     """
 
     def __init__(self, settings: TrainSection, side: int = STEP_SIDE):
@@ -107,12 +106,10 @@ class Schedule:
         steps.
 
         Choices: pruning masks go no farther in a long training than in one of MOST_STEPS. A penalty
-          that Adam turns
-          into steps of one size closes them for as long as it lasts: 8000 steps left a room 4,832
-            of 40,000 Gaussians.
-          While steps look at windows, all are slower by the photos' reduction: a Gaussian is in few
-          of them, and between them Adam's mean square of gradients falls, and each step would go
-          that much farther.
+          that Adam turns into steps of one size closes them for as long as it lasts: 8000 steps
+          left a room 4,832 of 40,000 Gaussians. While steps look at windows, all are slower by the
+          photos' reduction: a Gaussian is in few of them, and between them Adam's mean square of
+          gradients falls, and each step would go that much farther.
         """
         slower = min(MOST_STEPS / max(steps, 1), 1.0) if name == "prune_logits" else 1.0
         slower /= self.reduction if self.in_full(share) else 1

@@ -44,9 +44,8 @@ def ragged_rows(degree: Tensor) -> list[Tensor]:
 
     Args: degree u8 [N], 0 to 3.
     Returns: for bands 0 to 3, i64 [N_l]: the highest degree first and otherwise in their order, so
-      that each list
-      starts the one before: band l belongs to the first N_l Gaussians, and nothing has to point at
-        its rows.
+      that each list starts the one before: band l belongs to the first N_l Gaussians, and nothing
+      has to point at its rows.
     Raises: ValueError on a degree beyond 3.
     """
     if (degree > 3).any():

@@ -42,11 +42,12 @@ class Trainer:
     Args:
       settings: resolved, nothing left open (`stages.training.defaults`).
       extent:   scene units, scales the means' learning rate.
+
     The model's Gaussians say which device computes; views and cameras are to be there, too. On a
     GPU one step in READ_EVERY waits for its figures, the others for nothing: within these a loss
     that is not finite is found. `state_dict()` between two steps holds all that the steps to come
     depend on: a trainer that loads it takes them as this one does, to the bit, with as many
-      threads.
+    threads.
     """
 
     def __init__(self, model: SceneModel, views: Views, settings: TrainSection, extent: float):

@@ -4,13 +4,10 @@ Resolution: 640 pixels at most. Split: the source's own, otherwise every 8th vie
 Classes: the scene's own names; a label whose name is no class is wrong wherever it is predicted.
 One confusion matrix over all test views: mIoU over classes that occur in truth or prediction, mAcc
 over those in the truth, OA; mIoU within 5 pixels of a boundary, and over the five classes with the
-fewest pixels; the same for the teacher.
-3D point mIoU, where depth and poses say where pixels lie: over points of the test views' surfaces
-  (40,000 pixels a view
-on a regular grid, of which one a cell is kept: `metrics.thinned`), the scene's label is that of its
-  Gaussians there,
-without rendering; where it has none, it is wrong. The teacher's is the label of the pixel that the
-point comes from.
+fewest pixels; the same for the teacher. 3D point mIoU, where depth and poses say where pixels lie:
+over points of the test views' surfaces (40,000 pixels a view on a regular grid, of which one a cell
+is kept: `metrics.thinned`), the scene's label is that of its Gaussians there, without rendering;
+where it has none, it is wrong. The teacher's is the label of the pixel that the point comes from.
 """
 
 from __future__ import annotations

@@ -5,13 +5,11 @@ Resolution: 640 pixels at most, as Semantic-NeRF's renders have. Split: index % 
 Feature 3DGS sorts its students as text and its teachers as numbers, so that unpadded names pair
 different views; here views are joined on their names. Labels: the 150 names of ADE20K without a
 prompt template; of ids that count from 1, television (90) becomes door (15), rug (29) floor (4),
-pillow (58) cushion (40).
-Resizing: where a view is wider than 480 pixels, features of both become 480x360, bilinear with
-  aligned corners, which
-distorts; labels then become 159x119 by the nearest pixel. Averaging: by image, mean IoU over the 7
-labels that are most frequent in teacher and student together, and pixel accuracy; then the mean
-over images. Labels of equal frequency are taken in the order of their ids; Feature 3DGS leaves that
-open.
+pillow (58) cushion (40). Resizing: where a view is wider than 480 pixels, features of both become
+480x360, bilinear with aligned corners, which distorts; labels then become 159x119 by the nearest
+pixel. Averaging: by image, mean IoU over the 7 labels that are most frequent in teacher and student
+together, and pixel accuracy; then the mean over images. Labels of equal frequency are taken in the
+order of their ids; Feature 3DGS leaves that open.
 """
 
 from __future__ import annotations

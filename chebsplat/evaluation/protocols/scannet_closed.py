@@ -1,17 +1,14 @@
 """`scannet-closed` (Panoptic Lifting): 21 reduced classes and void on ScanNet.
 
 Split: that of splits.json, otherwise every 5th frame from the first. Truth: NYU's 40 classes
-  reduced to the 21 below,
-objects corrected by hand in nine scenes; void (0) is masked. Ids differ from `scannet-open` in two
-places (10 is counter, 11 shelves), so labels are joined on names. Resizing: labels to 512x512 by
-the nearest pixel, whatever the aspect; views keep theirs, at 592 pixels at most: of 4:3 as many
-pixels.
-Averaging: one confusion matrix a scene; a class with less than 0.5 % of both the predicted and the
-  true pixels is
-dropped; void counts as a class of IoU 0 where 0.5 % of the pixels are predicted void; mIoU of the
-rest; the mean over scenes (`averaged`) is not weighted. The peers learn from pseudo labels of
-Mask2Former with a confidence by pixel, which `teacher.kind = "given"` takes from the source; in the
-measure they play no part.
+reduced to the 21 below, objects corrected by hand in nine scenes; void (0) is masked. Ids differ
+from `scannet-open` in two places (10 is counter, 11 shelves), so labels are joined on names.
+Resizing: labels to 512x512 by the nearest pixel, whatever the aspect; views keep theirs, at 592
+pixels at most: of 4:3 as many pixels. Averaging: one confusion matrix a scene; a class with less
+than 0.5 % of both the predicted and the true pixels is dropped; void counts as a class of IoU 0
+where 0.5 % of the pixels are predicted void; mIoU of the rest; the mean over scenes (`averaged`) is
+not weighted. The peers learn from pseudo labels of Mask2Former with a confidence by pixel, which
+`teacher.kind = "given"` takes from the source; in the measure they play no part.
 """
 
 from __future__ import annotations

@@ -2,16 +2,13 @@
 training cameras.
 
 Split: no view is held out, and every view is evaluated. Truth: `label-filt` through column
-  `cocomapid`; 0 is ignored.
-Classes: the 20 below in this order; ids differ from `scannet-closed` in two places (10 is shelves,
-  11 counter), so
-labels are joined on names, never on ids. A leading prompt "other" is dropped before the largest
-cosine is taken: no pixel can be "other". Resizing: views are 648 pixels wide at most; predictions
-  and truth are compared at
-648x484, nearest pixel. Averaging: ONE confusion matrix summed over all scenes (`summed`); a class
-  that is absent
-from the truth is skipped, even where it is predicted; mIoU and mAcc. A scene's own figures are
-those of its matrix.
+`cocomapid`; 0 is ignored. Classes: the 20 below in this order; ids differ from `scannet-closed` in
+two places (10 is shelves, 11 counter), so labels are joined on names, never on ids. A leading
+prompt "other" is dropped before the largest cosine is taken: no pixel can be "other". Resizing:
+views are 648 pixels wide at most; predictions and truth are compared at 648x484, nearest pixel.
+Averaging: ONE confusion matrix summed over all scenes (`summed`); a class that is absent from the
+truth is skipped, even where it is predicted; mIoU and mAcc. A scene's own figures are those of its
+matrix.
 """
 
 from __future__ import annotations

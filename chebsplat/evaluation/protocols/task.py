@@ -84,8 +84,8 @@ def counted(pixels: np.ndarray) -> dict[str, int]:
 
 def mean_over(values: np.ndarray, pixels: np.ndarray) -> float | None:
     """Mean of the figures of classes that are defined, not nan; None where the truth, of so many
-    `pixels` by class,
-    has fewer than two: of one class alone any scene that knows no other has 100 %.
+    `pixels` by class, has fewer than two: of one class alone any scene that knows no other has 100
+    %.
     """
     if counted(pixels)["classes"] < 2 or np.isnan(values).all():
         return None
