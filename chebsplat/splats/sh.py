@@ -69,8 +69,8 @@ def light(coefficients: Tensor, directions: Tensor, degree: int, backend: str = 
       for.
     """
     if coefficients.device.type == "cuda" and backend != "reference":
-        seen: Tensor = gsplat().spherical_harmonics(degree, directions, coefficients)
-        return seen
+        colors: Tensor = gsplat().spherical_harmonics(degree, directions, coefficients)
+        return colors
     values = basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     return torch.einsum("nk,nkc->nc", values, coefficients[:, : n_coefficients(degree)])
 
