@@ -53,8 +53,7 @@ def canonicalize(means: Tensor, scales: Tensor, rotmats: Tensor, mask: Tensor) -
 
 
 def metric_factors(region: Region, anisotropy: float) -> Tensor:
-    """Y_i = diag(sqrt(m_i)) R_iᵀ with m_ik = 1 / (1 + a (s_ik / s̃)²) (Eq 1); |Y_i Δ|² is the
-    squared length of Δ.
+    """Y_i = diag(sqrt(m_i)) R_iᵀ with m_ik = 1 / (1 + a (s_ik / s̃)²) (Eq 1): Δ has length |Y_i Δ|.
 
     Returns: [M, n, 3, 3].
     Choices: s̃ is the region's median largest scale, so that anisotropy does not fade with the
@@ -77,7 +76,7 @@ def metric_factors(region: Region, anisotropy: float) -> Tensor:
 
 @torch.no_grad()
 def tangent_axis(region: Region) -> tuple[Tensor, Tensor]:
-    """The axis of least variance of the region's Gaussian mixture, and how well it is defined.
+    """Axis of least variance of the region's Gaussian mixture, and the certainty of it.
 
     Returns: axis [M, 3], of arbitrary sign; certainty [M], a smoothstep of the gap of the two
       smallest variances. Neither has a gradient: that of an eigenvector does not exist where
@@ -114,8 +113,7 @@ def rotations_about(axis: Tensor, n_angles: int) -> Tensor:
 
 
 def similarity(region: Region, factors: Tensor, rotmats: Tensor, bandwidth: float) -> Tensor:
-    """S = A^-1/2 W A^-1/2, so that I − S is similar to the random-walk Laplacian of Eq 3: same
-    spectrum, symmetric.
+    """S = A^-1/2 W A^-1/2: I − S is symmetric, and similar to the random-walk Laplacian of Eq 3.
 
     Args:
       factors: [M, n, 3, 3], from `metric_factors`.

@@ -44,7 +44,7 @@ def describe(
     scales: Tensor,
     rotmats: Tensor,
     mask: Tensor,
-    wanted: Descriptor,
+    parameters: Descriptor,
     *,
     dtype: torch.dtype,
 ) -> Tensor:
@@ -55,14 +55,14 @@ def describe(
       so that the sign of the axis does not matter; angles j > 0 fade to angle 0 where the axis is
       ill-defined; the axis has no gradient.
     """
-    region, n_angles = canonicalize(means, scales, rotmats, mask), wanted.n_angles
-    factors = metric_factors(region, wanted.anisotropy)
+    region, n_angles = canonicalize(means, scales, rotmats, mask), parameters.n_angles
+    factors = metric_factors(region, parameters.anisotropy)
     around, certainty = tangent_axis(region)
     count = region.mask.sum(1)[:, None, None]
     angles = []
     for rotation in rotations_about(around, n_angles):
-        S = similarity(region, factors, rotation, wanted.bandwidth)
-        angles.append(chebyshev_diagonals(S.to(dtype), wanted.max_degree) * count)
+        S = similarity(region, factors, rotation, parameters.bandwidth)
+        angles.append(chebyshev_diagonals(S.to(dtype), parameters.max_degree) * count)
     certainty = certainty.to(dtype)[:, None, None]
     keep = region.mask[..., None, None] & (count[..., None] > 1)
     paired = angles[:1]

@@ -1,6 +1,4 @@
-"""What the point encoder sees of a cloud of points: shape at several radii, and nothing of what it
-looks like.
-"""
+"""Inputs of the point encoder: shape of a cloud of points at several radii, without appearance."""
 
 from __future__ import annotations
 
@@ -107,7 +105,7 @@ def truncation(
     N_TRIED points, and between these points' descriptors of twice as many degrees.
 
     Args: as for `point_inputs`. Returns: in [0, 2]; None where fewer than 3 points, or only points
-      of one shape, are there to be told apart.
+      of one shape, are there.
     Choices: at the radius of middle size; points evenly through their order, which needs no seed.
     """
     rows = np.unique(np.linspace(0, len(means) - 1, min(N_TRIED, len(means))).round().astype(int))
@@ -160,9 +158,9 @@ def _regions(
     if len(rows):
         sample = first_of_each(means, SPACING * radius)
         count = min(MEMBERS, len(sample))
-        found, index = cKDTree(means[sample]).query(means[rows], count, workers=-1)
+        lengths, index = cKDTree(means[sample]).query(means[rows], count, workers=-1)
         near[:, :count] = sample[index.reshape(len(rows), count)]
-        distance[:, :count] = found.reshape(len(rows), count)
+        distance[:, :count] = lengths.reshape(len(rows), count)
     others = np.where((near == own) | (distance > 2 * radius), -1, near)
     order = np.argsort(others < 0, axis=1, kind="stable")
     return (

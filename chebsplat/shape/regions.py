@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from chebsplat.settings import DescribeSection
 
-SAMPLE = 65536  # points that stand for all where only a density is wanted
+SAMPLE = 65536  # points that stand for all in estimates of density
 
 
 class Regions(NamedTuple):
@@ -71,8 +71,10 @@ def farthest_points(means: np.ndarray, count: int, start: int) -> tuple[np.ndarr
     extent = float(np.abs(points).max())
     points = np.ascontiguousarray(points / (extent or 1.0), np.float32)
     height = int(np.clip(np.log2(n) - 4, 1, 9))
-    asked = min(count + 1, n)  # one more: its distance is the covering radius
-    picked = np.asarray(fpsample.bucket_fps_kdline_sampling(points, asked, height, start), np.int64)
+    n_picks = min(count + 1, n)  # one more: its distance is the covering radius
+    picked = np.asarray(
+        fpsample.bucket_fps_kdline_sampling(points, n_picks, height, start), np.int64
+    )
     _, first = np.unique(points[picked], axis=0, return_index=True)
     picked = picked[np.sort(first)]
     centers = picked[:count]
@@ -102,9 +104,7 @@ def _neighbourhoods(
     region_size: int,
     keys: np.ndarray,
 ) -> np.ndarray:
-    """members i64 [M, region_size]: the centre, then the nearest of the thinned points within the
-    radius.
-    """
+    """members i64 [M, region_size]: the centre, then the nearest thinned points in the radius."""
     thinned = np.flatnonzero(keys < share)
     where = means[centers]
     k = min(region_size, max(len(thinned), 1))
@@ -125,9 +125,7 @@ def _tree(points: np.ndarray) -> cKDTree:
 
 
 def _uniform(ids: np.ndarray, seed: int) -> np.ndarray:
-    """A number in [0, 1) for each id and seed, by a mixing of bits in which every one reaches every
-    other.
-    """
+    """A number in [0, 1) for each id and seed, by a mixing of bits that every one takes part in."""
     x = np.asarray(ids, np.uint64) + np.uint64(1 + (seed << 32) % 2**63)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)
