@@ -21,7 +21,7 @@ def is_compiled(tensor: Tensor, backend: str = "auto") -> bool:
 
 
 def gsplat() -> Any:
-    """The package that computes on a GPU, imported on first use. Raises ImportError: the remedy."""
+    """The package that computes on a GPU, imported on first use. Raises ImportError with remedy."""
     try:
         import gsplat as module
     except ImportError as error:

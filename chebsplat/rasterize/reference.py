@@ -116,7 +116,7 @@ def with_cells(colors: Tensor, cell_colors: Tensor | None) -> Tensor:
 
 
 def cell_means(images: Tensor) -> Tensor:
-    """Means [C, ⌈H/4⌉, ⌈W/4⌉, E] of images [C, H, W, E] over cells of 4×4 pixels within."""
+    """Means [C, ⌈H/4⌉, ⌈W/4⌉, E] of images [C, H, W, E] over cells of 4×4, cut at the edge."""
     means = torch.nn.functional.avg_pool2d(
         images.permute(0, 3, 1, 2), CELL, ceil_mode=True, count_include_pad=False
     )

@@ -125,7 +125,7 @@ def _tree(points: np.ndarray) -> cKDTree:
 
 
 def _uniform(ids: np.ndarray, seed: int) -> np.ndarray:
-    """A number in [0, 1) for each id and seed, by a mixing of bits that every one takes part in."""
+    """A number in [0, 1) for each id and seed, by mixing all their bits."""
     x = np.asarray(ids, np.uint64) + np.uint64(1 + (seed << 32) % 2**63)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)

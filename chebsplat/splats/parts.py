@@ -43,7 +43,7 @@ def parts(means: np.ndarray, scales: np.ndarray, selected: np.ndarray) -> np.nda
 def substantial(
     means: np.ndarray, scales: np.ndarray, selected: np.ndarray, least: float = 0.1
 ) -> np.ndarray:
-    """The selected without crumbs: bool [N], parts of a share `least` or more of the largest."""
+    """The selected, bool [N], in parts of at least a share `least` of the largest: no crumbs."""
     numbers = parts(means, scales, selected)
     sizes = np.bincount(numbers[selected])
     mask: np.ndarray = selected.copy()

@@ -49,7 +49,7 @@ def _along(means: Tensor, normals: Tensor, nearest: float) -> tuple[Tensor, Tens
 
 
 class _Planes(torch.autograd.Function):
-    """`planes_in_view`; by hand its gradient takes a fifth of the time."""
+    """`planes_in_view` with a gradient by hand, for a fifth of the time of autograd's."""
 
     @staticmethod
     def forward(

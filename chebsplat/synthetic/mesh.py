@@ -92,7 +92,7 @@ class Builder:
         profile: list[tuple[float, float]],
         n: int = 20,
     ) -> None:
-        """A surface of revolution about local z through (radius, height) points, with ends."""
+        """A surface of revolution about local z through (radius, height) points, ends closed."""
         angles = np.arange(n) * (2 * np.pi / n)
         rings = [
             np.stack([r * np.cos(angles), r * np.sin(angles), np.full(n, z)], 1) for r, z in profile

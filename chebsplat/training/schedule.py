@@ -25,7 +25,7 @@ def require_resolved(settings: TrainSection) -> None:
 
 
 def rates(settings: TrainSection) -> dict[str, float]:
-    """Learning rate of each raw parameter before any schedule; of `means` over scene extent."""
+    """Learning rate of each raw parameter before any schedule; of `means`: in scene extents."""
     by_name = {
         "means": settings.lr_means,
         "log_scales": settings.lr_scales,

@@ -99,7 +99,7 @@ def _point_mious(
 
 
 def rarest(pixels: np.ndarray) -> np.ndarray:
-    """Indices of the N_RAREST classes with the fewest `pixels` of truth, those without aside."""
+    """Indices of the N_RAREST classes with the fewest `pixels` of truth, but more than none."""
     return np.argsort(np.where(pixels > 0, pixels, np.inf), kind="stable")[
         : min(N_RAREST, int((pixels > 0).sum()))
     ]

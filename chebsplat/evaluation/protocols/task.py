@@ -102,7 +102,7 @@ def predicted(labels: np.ndarray, names: list[str], classes: list[str], unknown:
 def required(
     names: list[str], classes: tuple[str, ...], protocol: str, also: tuple[str, ...] = ()
 ) -> None:
-    """Raise DataFailure unless `names` are all the `classes`, in any order, and some of `also`."""
+    """Raise DataFailure unless `names` are `classes` in any order, and maybe some of `also`."""
     if absent := lacking(classes, names):
         raise DataFailure(
             f"{protocol} asks for its {len(classes)} classes; the teacher has no "
