@@ -214,7 +214,7 @@ def taught(job: Job, settings: TeachSection, examples: list[Example]) -> PointEn
     encoder.set_inputs(clouds)
     course = point_encoder.Course(steps=settings.steps, seed=settings.seed)
     losses: deque[float] = deque(maxlen=100)
-    steps = point_encoder.taught(encoder, examples, course)
+    steps = point_encoder.train_encoder(encoder, examples, course)
     for loss, status in job.progress.track(steps, settings.steps, "teach"):
         losses.append(loss)
         status["mean loss"] = f"{sum(losses) / len(losses):.4f}"

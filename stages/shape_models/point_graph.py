@@ -162,7 +162,7 @@ def _attended(graph: Graph, scale: Scale, embedded: str, neighbors: str, radius:
         return graph.add("Concat", largest, mean, axis=-1)
     normal, asked, learned = (
         _normalized(graph, tokens, scale.norm),
-        scale.asked(),
+        scale.project_query(),
         scale.norm(scale.token),
     )
     scores = graph.add("Where", there, graph.add("MatMul", normal, asked), number(-1e9))
@@ -180,7 +180,7 @@ def _attended(graph: Graph, scale: Scale, embedded: str, neighbors: str, radius:
     )
     gathered = graph.add("Reshape", gathered, whole(-1, asked.shape[0] * asked.shape[1]))
     token = graph.add(
-        "Add", graph.add("MatMul", gathered, scale.answered().flatten(0, 1)), scale.token
+        "Add", graph.add("MatMul", gathered, scale.project_values().flatten(0, 1)), scale.token
     )
     return graph.add("Concat", _fed(graph, scale, token), mean, axis=-1)
 
