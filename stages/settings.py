@@ -1,5 +1,4 @@
-"""Every setting of every stage: default, range and meaning. Values are part of an artifact's key;
-this code is not.
+"""Settings of the stages: default, range and meaning. Values are part of a key, this code is not.
 
 Those of descriptor and training are in `chebsplat/settings.py`, where the maths reads them.
 """
@@ -39,9 +38,7 @@ class SceneSection(Section):
 
 
 class SourceSection(Section):
-    """Where the photos come from. `named` is Replica's scene when REPLICA_ROOT has it, else the
-    generated one.
-    """
+    """Origin of the photos. `named`: Replica's scene if REPLICA_ROOT has it, else generated."""
 
     kind: Literal[
         "named",
@@ -167,11 +164,9 @@ class SfmSection(Section):
 
 
 class TeacherSection(Section):
-    """`auto`: the ONNX model if one is given, otherwise the embedded teacher, but none for
-    photographs without labels;
-    `embedded`: the embedded teacher for these, too; `labels`: the noisy-labels teacher; `given`:
-      pseudo labels with a
-    confidence that the source brings (Panoptic Lifting's ScanNet).
+    """The 2D teacher. `auto`: the ONNX model if one is named, otherwise the embedded teacher, but
+    none for photographs without labels; `embedded`: for these, too; `labels`: the noisy-labels
+    teacher; `given`: pseudo labels with a confidence in the source (Panoptic Lifting's ScanNet).
     """
 
     kind: Literal["auto", "embedded", "labels", "given", "onnx", "none"] = setting(
@@ -210,7 +205,7 @@ class TeacherSection(Section):
 
 
 class ChannelsSection(Section):
-    """What a teacher's channels are reduced to, for all scenes alike.
+    """Reduction of a teacher's channels, for all scenes alike.
 
     Choices: at most 32 channels. The embedded teacher's features span fewer (the artifact's facts
       say how many) and lose nothing. Of 512 channels stood in for LSeg's 32 keep 99.8 % of the
@@ -249,7 +244,7 @@ class LiftSection(Section):
 
     Choices: by agreement with a fifth of the training views that was held out (office0, noisy
       labels, 70 views): 42.8 mIoU for the mean, 43.5 after 5 median steps; gates from 0 to 0.2 are
-        alike within 0.1, and more costs.
+      alike within 0.1, and more costs.
     """
 
     gate: float = number(

@@ -1,6 +1,4 @@
-"""Progress of long work: a bar with rate and ETA on a terminal, plain lines elsewhere, `log.jsonl`
-always.
-"""
+"""Progress of long work: a bar with rate and ETA on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -55,22 +53,21 @@ class Progress:
     ) -> Iterator[tuple[T, dict[str, Any]]]:
         """Yield (item, status); what the caller puts into `status` is shown beside rate and ETA.
 
-        total: how many there will be, `start` of them done before; a function where that is only
-          found out on the way.
+        total: number of items, `start` of them done before; a function where it changes on the way.
         """
         status: dict[str, Any] = {}
         began = last = time.perf_counter()
         # the first item warms up and is not counted in the rate
-        for done, item in enumerate(items):
+        for index, item in enumerate(items):
             yield item, status
             now = time.perf_counter()
-            if done == 0:
+            if index == 0:
                 began = now
-            at = done + start + 1
+            at = index + start + 1
             n = total if isinstance(total, int) else total()
             if now - last >= (0.2 if self.show else self.every) or at == n:
                 last = now
-                rate = done / max(now - began, 1e-9)
+                rate = index / max(now - began, 1e-9)
                 eta = f"{(n - at) / rate:.0f} s" if rate > 0 else "unknown"
                 notes = "".join(f"  {k} {v}" for k, v in status.items())
                 line = f"{what} {at}/{n}{notes}  {rate:.1f}/s  ETA {eta}"

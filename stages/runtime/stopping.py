@@ -117,9 +117,9 @@ def streams(tell: Callable[[str], object]) -> Iterator[None]:
         sys.exit(error.exit_code)
 
 
-class Asked:
-    """What this process has been asked. `stop`: not at all, or what is raised; `since`: by the
-    monotonic clock.
+class StopRequest:
+    """A request that this process stop. `stop`: None until one comes, then the error to raise;
+    `since`: when, by the monotonic clock.
     """
 
     def __init__(self) -> None:
@@ -141,7 +141,7 @@ class Asked:
                 raise self.stop
 
 
-_asked: Asked | None = None
+_request: StopRequest | None = None
 
 
 @contextmanager
@@ -151,46 +151,44 @@ def heeded() -> Iterator[None]:
     What breaks because a stop has come, an import that it fell into, is the stop and no crash; a
     destructor, where nothing can be raised, says nothing of it.
     """
-    global _asked
-    outermost = _asked is None and threading.current_thread() is threading.main_thread()
-    asked, hook = _asked or Asked(), sys.unraisablehook
+    global _request
+    outermost = _request is None and threading.current_thread() is threading.main_thread()
+    request, hook = _request or StopRequest(), sys.unraisablehook
     before = {number: signal.getsignal(number) for number in SIGNALS} if outermost else {}
 
     def unless_stopped(unraisable: Any) -> None:
-        if asked.stop is None:
+        if request.stop is None:
             hook(unraisable)
 
     if outermost:
-        _asked, sys.unraisablehook = asked, unless_stopped
+        _request, sys.unraisablehook = request, unless_stopped
     for number, handler in before.items():
         if handler is not signal.SIG_IGN:
-            signal.signal(number, asked.heed)
+            signal.signal(number, request.heed)
     try:
         yield
     except Exception as error:
-        if asked.stop is not None:
-            raise asked.stop from error
+        if request.stop is not None:
+            raise request.stop from error
         raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
         if outermost:
-            _asked, sys.unraisablehook = None, hook
+            _request, sys.unraisablehook = None, hook
 
 
 @contextmanager
-def deferred() -> Iterator[Asked]:
-    """Nothing is raised within, but at the end: the block looks at `stop` itself, and comes to one
-    within a moment.
-    """
-    asked = _asked or Asked()
-    asked.deferred = True
+def deferred() -> Iterator[StopRequest]:
+    """Defer `Stopped` to the end of the block, which looks at `stop` itself every few moments."""
+    request = _request or StopRequest()
+    request.deferred = True
     try:
-        yield asked
+        yield request
     finally:
-        asked.deferred = False
-    if asked.stop is not None:
-        raise asked.stop
+        request.deferred = False
+    if request.stop is not None:
+        raise request.stop
 
 
 def end_itself() -> None:

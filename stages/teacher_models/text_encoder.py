@@ -47,7 +47,9 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
     if embeddings is None:
         known, embeddings = [], np.zeros((0, 0))
     unique_names = list(dict.fromkeys(names))
-    row = dict(zip(unique_names, found(unique_names, known, teacher.text is None), strict=True))
+    row = dict(
+        zip(unique_names, match_names(unique_names, known, teacher.text is None), strict=True)
+    )
     vectors = {name: embeddings[k] for name, k in row.items() if k >= 0}
     for name in vectors:
         if folded(known[row[name]]) != folded(name):
@@ -58,7 +60,7 @@ def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
     return rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-12)
 
 
-def found(names: list[str], known: list[str], last_word: bool = True) -> list[int]:
+def match_names(names: list[str], known: list[str], last_word: bool = True) -> list[int]:
     """Where each name stands among those known, -1 where it does not; looked up as in a table of
     labels.
     """
