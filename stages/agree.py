@@ -24,8 +24,7 @@ AGREED = 0.3  # agreement that no teacher has by chance
 
 
 def run(job: Job) -> None:
-    """The training views' agreement on the same points, without true labels (docs/method.md,
-    section 9).
+    """Agreement of the training views on labels of the same points (docs/method.md, section 9).
 
     Reads `capture`, `points` and `features`. Writes `agreement`.
     """
@@ -57,19 +56,16 @@ def run(job: Job) -> None:
     elif value >= AGREED and (sure := sure_of(features, [at for _, _, at in views])) < UNSURE:
         job.facts["doubt"] = (
             f"views agree by {value:.2f} on what points are (1: always, 0: by chance), and the "
-            "teacher is sure by "
-            f"{sure:.2f} only: its outputs are flat, as of a softmax taken twice, of logits that "
-            "were scaled down, or "
-            "of photos in another range than it was trained on; `chebsplat check-teacher` tries "
-            "the usual ones"
+            f"teacher is sure by {sure:.2f} only: its outputs are flat, as of a softmax taken "
+            "twice, of logits that were scaled down, or of photos in another range than it was "
+            "trained on; `chebsplat check-teacher` tries the usual ones"
         )
         log.warning("%s", job.facts["doubt"])
     elif value < settings.low:
         job.facts["doubt"] = (
             f"views agree by {value:.2f} on what points are (1: always, 0: by chance), below "
-            f"{settings.low:g}: the 2D "
-            "teacher does not know this scene; name another (docs/teachers.md), or "
-            "teacher.kind=none for colour alone"
+            f"{settings.low:g}: the 2D teacher does not know this scene; name another "
+            "(docs/teachers.md), or teacher.kind=none for colour alone"
         )
         log.warning("%s", job.facts["doubt"])
     else:
@@ -78,7 +74,7 @@ def run(job: Job) -> None:
 
 
 def sure_of(features: Features, views: list[int]) -> float:
-    """Sureness of a segmenter in its likeliest class; 1 of others, whose cosines do not tell."""
+    """Sureness of a segmenter in its likeliest class; 1 of others, as cosines are no certainty."""
     if features.convention.get("output") != "logits" or features.confidence is None:
         return 1.0
     mean = np.mean([np.asarray(features.confidence[view], np.float32).mean() for view in views])

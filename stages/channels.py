@@ -3,7 +3,7 @@
 See docs/method.md, section 8.
 
 It is computed from the teacher, its words and reference images, and from nothing of a scene, so
-that what one scene learns about shape and meaning carries over to the next.
+that knowledge of shape and meaning carries over from one scene to the next.
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ CHECKED = 20_000  # pixels whose labels before and after are compared
 
 
 def run(job: Job) -> None:
-    """The directions of a teacher's features that scenes are trained in (docs/method.md, section
-    8).
+    """Directions of a teacher's features to train scenes in (docs/method.md, section 8).
 
     Reads no artifact: a teacher, its words and reference images. Writes `channels`.
     """
@@ -68,8 +67,7 @@ def run(job: Job) -> None:
             if words is not None and words.shape[1] != n_channels:
                 raise InputError(
                     f"{teacher.path} has {n_channels} channels, {teacher.labels} embeds in "
-                    f"{words.shape[1]}; export "
-                    "them from one model"
+                    f"{words.shape[1]}; export them from one model"
                 )
         features = network.features(image, grid, (1.0,), False, name)
         moments.add(features)

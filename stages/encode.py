@@ -19,13 +19,10 @@ def run(job: Job) -> None:
 
     Reads `descriptors`, and the encoder of the `knowledge` that ships. Writes `encoding`, of no
     point where there are no descriptors.
-    Choices: half precision, whose error is a hundredth of what one point's features differ from the
-      next one's by.
+    Choices: half precision, whose error is a hundredth of the difference between points' features.
     """
-    start, descriptors = (
-        read_knowledge(job.inputs["start"]),
-        Descriptors.read(job.inputs["descriptors"]),
-    )
+    start = read_knowledge(job.inputs["start"])
+    descriptors = Descriptors.read(job.inputs["descriptors"])
     torch.set_num_threads(n_threads())
     try:
         inputs = inputs_of(job.inputs["start"], descriptors, start)

@@ -42,8 +42,7 @@ log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
-    """Colour and semantics of the exported scene on its protocol's views (docs/method.md, section
-    10).
+    """Measure the exported scene on its protocol's views (docs/method.md, section 10).
 
     Reads `capture`, `scene` and, for the teacher's own figures, `features`. Writes `evaluation`.
     """
@@ -90,7 +89,7 @@ def run(job: Job) -> None:
         job, renderer, dict(zip(names, cameras, strict=True)), capture, scene, stacks
     )
     segmentation = segmented(job, protocol, views, capture, scene, renderer)
-    for _ in views:  # whatever the protocol did not look at
+    for _ in views:  # views that the protocol did not use
         pass
     pictures |= {name: np.stack(maps) for name, maps in stacks.items()}
     masks = None if capture.loss_mask is None else [capture.loss_mask[row[name]] for name in names]

@@ -23,7 +23,7 @@ def run(job: Job) -> None:
     or `lifted`. Writes `scene`.
 
     Choices: a Gaussian that no training view sees has lifted features of zero: no label, and no
-      part in what a view of the features shows.
+      part in rendered features.
     """
     gaussians = Gaussians.read(job.inputs["gaussians"])
     if len(gaussians.parameters["means"]) == 0:

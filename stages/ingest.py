@@ -39,7 +39,7 @@ from chebsplat.stages.sources.common import resolve_source
 
 log = logging.getLogger("chebsplat")
 
-ALONE = ("photos", "video")  # kinds of source whose poses are not known
+ALONE = ("photos", "video")  # kinds of source without poses
 NAMED = 20  # blurred views in a message
 SEED = 0  # of all disturbances: the studies compare trainings on the same ones
 
@@ -113,8 +113,7 @@ def every(names: list[str], step: int, offset: int) -> np.ndarray:
 
 
 def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dict[str, Any]]:
-    """Test views by the protocol's rule, bool [V], and the protocol with its parameters, for the
-    record.
+    """Test views by the protocol's rule, bool [V], and the protocol with its parameters.
 
     Args: own: bool [V], the source's own split, or None.
     Raises: ConfigError if the config changes a rule that is part of a protocol's name; DataFailure
@@ -145,9 +144,8 @@ def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dic
     if is_test.all() or not is_test.any():
         raise DataFailure(
             f"of {len(names)} views every one whose index % {step} is {offset} is a test view "
-            "(ingest.test_every, "
-            f"ingest.test_offset): that is {'all' if is_test.any() else 'none'} of them; add "
-            "views or change the rule"
+            "(ingest.test_every, ingest.test_offset): that is "
+            f"{'all' if is_test.any() else 'none'} of them; add views or change the rule"
         )
     return is_test, record | by_index
 
@@ -175,10 +173,9 @@ def thinned(fields: dict[str, Any], max_train_views: int | None) -> dict[str, An
 
 
 def renamed(fields: dict[str, Any], classes: dict[str, list[str]]) -> dict[str, Any]:
-    """Labels [V, H, W] in these classes, -1 where the source's class stands for none, and their
-    names.
+    """Labels [V, H, W] in these classes, -1 of source classes in none, and the classes' names.
 
-    Raises: ConfigError where the source has no labels, or no class of a name that is given.
+    Raises: ConfigError where the source has no labels, or no class of one of the names.
     """
     own, labels = fields.get("class_names"), fields.get("labels")
     if own is None or labels is None:
@@ -290,11 +287,10 @@ def normalised(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def recolored(images: np.ndarray, is_test: np.ndarray, stops: float) -> np.ndarray:
-    """Images u8 [V, H, W, 3] with an exposure of ± `stops` and a white balance of ± a quarter of
-    it, by training view.
+    """Images u8 [V, H, W, 3] of random exposures, ± `stops`, and white balances, by training view.
 
-    Choices: linear light is multiplied, by uniform logarithms whose mean over the training views is
-      0; what is too bright is cut off, as a sensor does.
+    Choices: linear light is multiplied, by uniform logarithms (white balance: of a quarter of the
+      range) whose mean over the training views is 0; bright values are clipped, as by a sensor.
     """
     rng, rows = np.random.default_rng(SEED), np.flatnonzero(~is_test)
     logs = rng.uniform(-stops, stops, (len(rows), 1)) + rng.uniform(
@@ -307,11 +303,9 @@ def recolored(images: np.ndarray, is_test: np.ndarray, stops: float) -> np.ndarr
 
 
 def displaced(poses: np.ndarray, is_test: np.ndarray, degrees: float, shift: float) -> np.ndarray:
-    """Poses [V, 4, 4] turned about their centres by `degrees` and shifted by `shift` scene units,
-    by training view.
+    """Poses [V, 4, 4]; each training view turned by `degrees` and shifted by `shift` scene units.
 
-    Choices: directions are random; the mean motion of the world that they amount to is taken out,
-      to first order.
+    Choices: directions are random; their mean, a motion of the world, is removed to first order.
     """
     rng, rows = np.random.default_rng(SEED), np.flatnonzero(~is_test)
     turns, shifts = (rng.normal(size=(len(rows), 3)) for _ in range(2))
@@ -343,7 +337,7 @@ def disturbed(
         )
     if degrees > 0 or shift > 0:
         changed["cam_from_world"] = displaced(fields["cam_from_world"], is_test, degrees, shift)
-        changed["tracks"] = None  # they tell of the poses as they were
+        changed["tracks"] = None  # they are of the original poses
         notes.append(
             f"Poses of the training views are disturbed by {degrees:g}° and {shift:g} scene units."
         )

@@ -39,7 +39,7 @@ from chebsplat.stages.teacher_models.text_encoder import match_names
 
 REACH = 0.3  # metres from a label to the described point that it is of
 KIND = {"depth": "held_out", "swept depth": "held_out_swept"}  # of rooms, by kind of surface
-# times the largest novelty of such rooms, which were held out: what is newer is of another kind
+# times the largest novelty of such rooms, held out: a scene above it is new in kind
 KNOWN = 1.05
 VOUCHED = ("labels", "given")  # kinds of teacher that the user answers for
 
@@ -125,8 +125,7 @@ def average_views(
     features: Features,
     descriptors: Descriptors,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean feature of each described point over the training views, f64 [N, d], and how many views
-    see it [N].
+    """Mean features of the described points over training views, f64 [N, d]; numbers of views [N].
 
     Raises: DataFailure where no training view has a camera and features.
     """
@@ -195,10 +194,8 @@ def labelled(
             f"{path}: no point lies within {REACH} m of the scene's surface; give x, "
             "y, z in its frame"
         )
-    meanings, embeddings = (
-        np.zeros((len(means), start.matrix.shape[1]), np.float32),
-        units(start.embeddings[rows]),
-    )
+    meanings = np.zeros((len(means), start.matrix.shape[1]), np.float32)
+    embeddings = units(start.embeddings[rows])
     np.add.at(meanings, nearest[beside], embeddings[beside])
     return units(meanings), np.where(meanings.any(1), LEAST_VIEWS, 0), np.unique(embeddings, axis=0)
 

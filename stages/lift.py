@@ -16,10 +16,8 @@ def run(job: Job) -> None:
 
     Reads `capture`, `gaussians` and `features`. Writes `lifted`.
     """
-    capture, gaussians = (
-        Capture.read(job.inputs["capture"]),
-        Gaussians.read(job.inputs["gaussians"]),
-    )
+    capture = Capture.read(job.inputs["capture"])
+    gaussians = Gaussians.read(job.inputs["gaussians"])
     features = Features.read(job.inputs["features"])
     lifted = lifted_from(
         capture,

@@ -17,7 +17,7 @@ from chebsplat.stages.shape_models.point_graph import point_contract, point_mode
 
 ENCODER = "encoder.onnx"
 TOLERANCE = 1e-4  # largest difference from torch
-N_COMPARED = 2048  # points of the scene that both are asked of
+N_COMPARED = 2048  # points of the scene, for the comparison
 
 
 def run(job: Job) -> None:

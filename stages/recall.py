@@ -18,7 +18,7 @@ from chebsplat.stages.runtime.command import Job
 
 # share of labels that shape and teacher have alike: below it no trust, above it all
 ALIKE = 0.5, 0.75
-# the same of labels that were given: what is as good as drawn at random is no label of this room
+# the same of labels that the user vouches for: below it they are as good as random
 GIVEN = 0.1, 0.2
 FAMILIAR = 0.4  # the same of how sure the teacher is beside shape (`blend.familiar`), from 0 up
 
@@ -58,10 +58,8 @@ def combine_lessons(start: Knowledge, lessons: Mapping[str, Lesson]) -> Knowledg
     """
     shipped = [Sums(*of) for of in start.shipped]
     used = {key: of for key, of in sorted(lessons.items()) if "none" not in of.notes}
-    sums, trust = (
-        [Sums(*of.sums) for of in used.values()],
-        [trusted(of.notes) for of in used.values()],
-    )
+    sums = [Sums(*of.sums) for of in used.values()]
+    trust = [trusted(of.notes) for of in used.values()]
     new = [of.notes["novelty"] > of.notes["known"] for of in used.values()]
     growing = [k for k, weight in enumerate(trust) if new[k] and weight > 0]
     growth = combined(

@@ -130,10 +130,8 @@ def predict_from_shape(
         raise ConfigError(
             f"knowledge is of described points and a teacher; pass --in-{absent[0]}, too"
         )
-    descriptors, encoding = (
-        Descriptors.read(job.inputs["descriptors"]),
-        Encoding.read(job.inputs["encoding"]),
-    )
+    descriptors = Descriptors.read(job.inputs["descriptors"])
+    encoding = Encoding.read(job.inputs["encoding"])
     if not len(encoding.features):
         job.left_out("knowledge of shape", encoding.notes["none"])
         return None

@@ -1,6 +1,4 @@
-"""The stages and what each reads: the one table behind the commands, the planner and the
-Snakefile.
-"""
+"""Table of the stages and their inputs, for the commands, the planner and the Snakefile."""
 
 from __future__ import annotations
 
@@ -31,12 +29,12 @@ class Stage:
     optional: tuple[tuple[str, str], ...] = ()
     help: str = ""
 
-    of_scene: bool = True  # false: never a part of a scene's run, only what such a run is given
+    of_scene: bool = True  # false: never a part of a scene's run, only an input of one
     # stages of the scene that come first, although nothing of theirs is read
     after: tuple[str, ...] = ()
-    # computes on a GPU where one is used, to other bytes than the CPU's: the key says so then
+    # runs on a GPU where one is used, to other bytes than the CPU's: the device is in the key then
     on_device: bool = False
-    device_packages: tuple[str, ...] = ()  # what it computes with there
+    device_packages: tuple[str, ...] = ()  # that it uses there
 
     def schemas(self, roles: Iterable[str]) -> dict[str, str]:
         """Schema of the input of each role; `lesson-KEY`, one of many, has that of `lesson`.

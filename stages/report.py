@@ -52,17 +52,17 @@ BYTES = {
     "ragged": "ragged arrays",
     "semantic": "semantic arrays, beside either",
 }
-# layouts of what plain 3DGS holds, without the bands that were pruned
+# layouts of plain 3DGS's values without the pruned bands
 SMALLER = ("split", "ragged")
 FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 
 
 def run(job: Job) -> None:
-    """One HTML page, and the figures as CSV, of what was measured and where it comes from.
+    """One HTML page, and the figures as CSV, of a scene's measurements and their origin.
 
-    Reads `evaluation` and `gaussians`, and of `model`, `capture`, `points`, `channels`, `features`,
-    `agreement`, `descriptors`, `encoding`, `lesson`, `knowledge`, `encoder`, `lifted`, `refined`
-    and `scene` what there is. Writes `report`.
+    Reads `evaluation` and `gaussians`, and, where there are, `model`, `capture`, `points`,
+    `channels`, `features`, `agreement`, `descriptors`, `encoding`, `lesson`, `knowledge`,
+    `encoder`, `lifted`, `refined` and `scene`. Writes `report`.
     """
     evaluation = Evaluation.read(job.inputs["evaluation"])
     gaussians = Gaussians.read(job.inputs["gaussians"])
@@ -72,11 +72,9 @@ def run(job: Job) -> None:
         )
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
     if "knowledge" in manifests and manifests["knowledge"].stage != STAGE_OF["knowledge"]:
-        del manifests["knowledge"]  # it ships, or was given: no stage of this scene has made it
-    facts, figures = (
-        {role: manifest.facts for role, manifest in manifests.items()},
-        evaluation.figures,
-    )
+        del manifests["knowledge"]  # it ships, or is the user's: no stage of this scene has made it
+    facts = {role: manifest.facts for role, manifest in manifests.items()}
+    figures = evaluation.figures
     left_out = absent_stages(job, gaussians) | figures["left_out"]
     for of_input in facts.values():
         left_out |= of_input.get("left_out", {})
@@ -173,7 +171,7 @@ def describe_poses(model: PhotoModel) -> dict[str, Any]:
 
 
 def decided_rows(facts: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Settings that the training's config left open: name, value, and what decided it."""
+    """Settings that the training's config left open: name, value, and reason."""
     return [
         (f"train.{name}", f"{value:.3g}" if isinstance(value, float) else str(value), of["by"])
         for name, of in facts.get("decided", {}).items()
@@ -221,7 +219,7 @@ def summary_rows(
     trained: dict[str, Any],
     timed: dict[str, str],
 ) -> list[list[str]]:
-    """Header, then (figure, scene, teacher). What was not measured says so.
+    """Header, then (figure, scene, teacher), "not measured" where there is no figure.
 
     Args: by_degree: Gaussians by SH degree, None where unknown; trained: facts of the training;
       timed: the machines that `evaluation` and training (`gaussians`) were measured on.
@@ -294,7 +292,7 @@ def summary_rows(
 
 
 def taken_rows(figures: dict[str, Any] | None) -> list[list[str]]:
-    """Rows of figures on the test photos as taken; none where these are as they were trained on."""
+    """Rows of figures on the test photos as taken; none where these are the test views."""
     if figures is None:
         return []
     size = "{}×{}".format(*figures["size"])

@@ -13,7 +13,7 @@ from chebsplat.formats.names import unprintable
 from chebsplat.settings import Section, number, seed, setting
 
 MAX_CHANNELS = 64  # that can be rendered
-SIDES = {  # pixels: the longest side that a protocol's views have, as its module says
+SIDES = {  # pixels: the longest side of a protocol's views
     "labels": 640,
     "replica-f3": 640,
     "replica-gt": 640,
@@ -93,7 +93,7 @@ class IngestSection(Section):
         None,
         "JSON of named volumes, which label what depth shows; default: the source's own labels",
     )
-    # for studies: what real cameras do, of known strength, to the training views alone
+    # for studies: errors of real cameras, of known strength, on the training views alone
     disturb_colors: float = number(
         0.0, "exposures at random, in stops; a quarter of it in white balance", 0, 8
     )
@@ -207,8 +207,8 @@ class TeacherSection(Section):
 class ChannelsSection(Section):
     """Reduction of a teacher's channels, for all scenes alike.
 
-    Choices: at most 32 channels. The embedded teacher's features span fewer (the artifact's facts
-      say how many) and lose nothing. Of 512 channels stood in for LSeg's 32 keep 99.8 % of the
+    Choices: at most 32 channels. The embedded teacher's features span fewer (the number is in
+      the artifact's facts) and lose nothing. Of 512 channels like LSeg's 32 keep 99.8 % of the
       decisions between 150 words where the spectrum falls as k^-3 and 95 % where it falls as k^-1;
       13 keep 98 and 77 %. 48 are needed for 1 % relative error in the first case; in the second no
       57 channels, the most that 20 MB a view hold, come below 18 %.
@@ -258,8 +258,7 @@ class RefineSection(Section):
     start: Literal["auto", "trained", "lifted", "both"] = setting(
         "auto",
         "features that are refined, both: midway between their directions; auto: both where the "
-        "capture has depth, "
-        "trained where it has not, lifted where none are trained",
+        "capture has depth, trained where it has not, lifted where none are trained",
     )
     smooth: Literal["auto", "on", "off"] = setting(
         "auto",
@@ -279,8 +278,7 @@ class KnowledgeSection(Section):
     start: Text = setting(
         "rooms",
         "what a scene starts from: none; shipped, to which nothing is added; the name of a set of "
-        "lessons in the "
-        "work folder, which its own joins; or folder/ of a knowledge artifact",
+        "lessons in the work folder, which its own joins; or folder/ of a knowledge artifact",
     )
 
 

@@ -27,7 +27,7 @@ Cloud = dict[str, Any]
 N_NEIGHBORS = 16  # that give a point its normal and covariance
 CANDIDATES = 16  # pixels with depth that are drawn for each point of `sfm.max_points`
 TRIED = 2000  # points that are compared with depth
-EVEN = 0.55  # of the points wanted: there whatever the colours are, for shape is read off these
+EVEN = 0.55  # of `sfm.max_points`: spaced evenly whatever the colours, for shape
 
 
 def run(job: Job) -> None:
@@ -122,8 +122,8 @@ def filled(
     """Union of two clouds of the same views, thinned to one point a cube, at most `count`.
 
     Args:    name: of the note that counts the points of `more`.
-    Choices: triangulated points show where the photos have texture, those of depth what lies
-      between; a cube with both keeps the triangulated one.
+    Choices: triangulated points lie where the photos have texture, those of depth in between; a
+      cube with both keeps the triangulated one.
     """
     rows, union = reduced(joined(cloud, more), count, spacing)
     union["notes"] |= {name: int((rows >= len(cloud["means"])).sum())}
@@ -164,17 +164,14 @@ def reduced(cloud: Cloud, count: int, spacing: str) -> tuple[np.ndarray, Cloud]:
 def from_depth(
     job: Job, capture: Capture, settings: SfmSection, poses: np.ndarray | None = None
 ) -> Cloud:
-    """Points back-projected from the depth of training views, CANDIDATES times `sfm.max_points`, in
-    random order.
+    """Points from depth of training views, CANDIDATES times `sfm.max_points`, in random order.
 
     Args: poses [V, 4, 4]: of the capture's views where they were adjusted.
     Choices: test views give no points; pixels are drawn evenly over views.
     """
     assert capture.cam_from_world is not None and capture.depth is not None
-    rng, poses = (
-        np.random.default_rng(settings.seed),
-        capture.cam_from_world if poses is None else poses,
-    )
+    rng = np.random.default_rng(settings.seed)
+    poses = capture.cam_from_world if poses is None else poses
     used = np.flatnonzero(~capture.is_test)
     per_view = max(CANDIDATES * settings.max_points // max(len(used), 1), 16)
     means, colors, view_of = [], [], []

@@ -48,7 +48,7 @@ from chebsplat.synthetic.layout import KNOWLEDGE
 log = logging.getLogger("chebsplat")
 KINDS = ("held_out", "held_out_worn", "held_out_few", "held_out_swept")
 N_DRAWN = 3000  # points of a room that its lesson is of
-PARTS = 2  # that the rooms' sums are kept in
+PARTS = 2  # into which the rooms' sums are split
 
 
 def run(job: Job) -> None:
@@ -137,7 +137,7 @@ def run(job: Job) -> None:
 def mean_lesson(
     job: Job, encoder: PointEncoder, rooms: Sequence[Sequence[Room]], embeddings: np.ndarray
 ) -> Sums:
-    """The mean lesson of rooms, each as depth has it, worn, half seen and swept."""
+    """Mean lesson of rooms, each in all its versions."""
     flat = [room for kinds in rooms for room in kinds]
     parts = (
         drawn_lesson(encoder, room, embeddings)

@@ -76,8 +76,8 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
         elif n_channels > MAX_CHANNELS:
             raise ConfigError(
                 f"{teacher.path} has {n_channels} channels, at most {MAX_CHANNELS} can be "
-                "rendered; use "
-                "`chebsplat run`, or reduce them with `chebsplat channels` and pass --in-channels"
+                "rendered; use `chebsplat run`, or reduce them with `chebsplat channels` and pass "
+                "--in-channels"
             )
         labels = label_set(teacher, settings.labels, capture.class_names)
         space = open_vocabulary(teacher, labels, n_channels, channels)
@@ -146,10 +146,8 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
         )
     codes = class_codes(capture.class_names, settings.n_channels)
     training = np.flatnonzero(~capture.is_test)
-    images, labels = (
-        np.asarray(capture.images[:])[training],
-        np.asarray(capture.labels[:])[training],
-    )
+    images = np.asarray(capture.images[:])[training]
+    labels = np.asarray(capture.labels[:])[training]
     probabilities = model.confusable(model.class_colors(images, labels, len(codes)))
     rows = []
     for view, _ in job.progress.track(range(len(capture.names)), len(capture.names), "teacher"):

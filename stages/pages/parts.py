@@ -172,8 +172,7 @@ def legend(pixels: Counter[int], names: list[str], colors: dict[str, str]) -> li
 def picture_rows(
     evaluation: Evaluation, names: list[str], count: int, out: Path
 ) -> tuple[list[dict[str, Any]], Counter[int]]:
-    """Pictures (key, URI, caption) of evenly spaced views, and pixels of each label in them; writes
-    a PNG of the first two.
+    """Pictures (key, URI, caption) of some views, and pixels of each label; writes pictures.png.
 
     Raises: InputError if a picture holds a label that has no name.
     """

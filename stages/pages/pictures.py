@@ -128,9 +128,7 @@ def cameras(eyes: np.ndarray, ups: np.ndarray, points: np.ndarray, errors: np.nd
 
 
 def course(of: Course, test_psnr: float) -> str:
-    """PSNR and accuracy of labels against seconds from the start, over bands of the stages, as
-    inline SVG.
-    """
+    """PSNR and accuracy of labels against seconds, over bands of the stages, as inline SVG."""
     matplotlib.use("Agg")
     with matplotlib.rc_context(
         {"svg.hashsalt": "course", "svg.fonttype": "none", "font.family": "sans-serif"}

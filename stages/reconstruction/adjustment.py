@@ -131,8 +131,7 @@ def _notes(
     }
     log.info(
         "poses adjusted to the photos: moved by %.3g scene units and %.2g° (medians), %d of %d "
-        "held near the given; "
-        "focal length %.1f -> %.1f px; reprojection error %.2f -> %.2f px",
+        "held near the given; focal length %.1f -> %.1f px; reprojection error %.2f -> %.2f px",
         notes["poses_moved"],
         notes["poses_turned_degrees"],
         notes["poses_kept"],
@@ -233,8 +232,7 @@ def localized(
 
 
 def alignment(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, rotation [3, 3] and shift [3] from the world of poses `source` to that of `target`,
-    both [V, 4, 4].
+    """Scale, rotation [3, 3], shift [3] from the world of poses `source` [V, 4, 4] to `target`'s.
 
     Choices: the rotation is the mean over views, not that of the centres, which is undetermined
       where they lie on a line. The scale is 1 where all centres coincide.

@@ -28,8 +28,8 @@ DEPTHS, NEIGHBORS = 96, 8
 WITNESSES = 64  # views, the nearest, that confirm or deny a view's depth
 # of the nearest point in a photo (1st percentile), and of the farthest one in any (99th)
 NEAR, FAR = 0.7, 5.0
-MOST_COST, AGREE = 0.5, 2  # what counts: cost, views that confirm a depth
-# of the points in the cube of a middling one, and three: what few pixels show is seldom there
+MOST_COST, AGREE = 0.5, 2  # of a depth that counts: cost at most, views that confirm it
+# of the points in a median cube, and at least three: surfaces of few pixels are mostly wrong
 LEAST = 0.2
 MOST = 12_000  # points in all: the first Gaussians, which growth needs room beside
 CELLS = 20  # cells along the longer side of a photo, for the share of cells that hold a point
@@ -219,10 +219,8 @@ def backdrop(capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
         [np.zeros(0, np.int64)],
     )
     for k in used:
-        empty, view = (
-            ~cells_with(Ks[k], poses[k], cloud["means"], capture.size),
-            row[cloud["names"][k]],
-        )
+        empty = ~cells_with(Ks[k], poses[k], cloud["means"], capture.size)
+        view = row[cloud["names"][k]]
         small = Image.fromarray(capture.images[view]).resize(
             empty.shape[::-1], Image.Resampling.BOX
         )
@@ -231,10 +229,8 @@ def backdrop(capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
                 empty.shape[::-1], Image.Resampling.NEAREST
             )
             empty &= np.asarray(counted)
-        pixels, scale = (
-            np.argwhere(empty),
-            np.array([empty.shape[1] / width, empty.shape[0] / height, 1.0]),
-        )
+        pixels = np.argwhere(empty)
+        scale = np.array([empty.shape[1] / width, empty.shape[0] / height, 1.0])
         means.append(unproject(np.full(empty.shape, far), scale[:, None] * Ks[k], poses[k], pixels))
         colors.append(np.asarray(small)[tuple(pixels.T)])
         view_of.append(np.full(len(pixels), k))

@@ -161,16 +161,13 @@ def angle(model: pycolmap.Reconstruction, eyes: dict[int, np.ndarray]) -> float:
 
 def doubts(facts: dict[str, Any]) -> list[str]:
     """Doubts about a model, each with its remedy; none about a good one."""
-    absent, others = (
-        facts["n_given"] - facts["n_registered"] - facts["n_misplaced"],
-        facts["n_in_others"],
-    )
+    absent = facts["n_given"] - facts["n_registered"] - facts["n_misplaced"]
+    others = facts["n_in_others"]
     messages = []
     if others and absent > 0.1 * facts["n_given"]:
         messages.append(
-            f"The photos fall into {len(others) + 1} groups that hardly meet; the largest is "
-            f"used, {absent} photos "
-            "are not: photograph what lies between, or make a scene of each."
+            f"The photos fall into {len(others) + 1} groups that hardly meet; the largest is used, "
+            f"{absent} photos are not: photograph what lies between, or make a scene of each."
         )
     elif absent > 0.1 * facts["n_given"]:
         messages.append(
@@ -184,15 +181,13 @@ def doubts(facts: dict[str, Any]) -> list[str]:
     if facts["pairs_agree"] < AGREE:
         messages.append(
             f"Only {facts['pairs_agree']:.0%} of the pairs of photos agree with where the model "
-            "puts them: something "
-            "repeats, mirrors or moves in the scene, or the lens changed; check the poses, and "
-            f"{REMEDY}."
+            "puts them: something repeats, mirrors or moves in the scene, or the lens changed; "
+            f"check the poses, and {REMEDY}."
         )
     if facts["mapped_error"] > LOOSE:
         messages.append(
             f"Points miss their photos by {facts['mapped_error']:.1e} of their side: the lens or "
-            "what is shown moved "
-            "while it was photographed; lock focus and zoom."
+            "what is shown moved while it was photographed; lock focus and zoom."
         )
     if facts["points_a_view"] < SCARCE:
         messages.append(
@@ -206,10 +201,9 @@ def sentence(facts: dict[str, Any]) -> str:
     """The figures of a model in words."""
     return (
         f"{facts['n_registered']} of {facts['n_given']} photos registered, {facts['n_points']} "
-        "points in "
-        f"{facts['track_length']:.1f} photos each, {facts['reprojection_error_px']:.2f} px, "
-        f"{facts['pairs_agree']:.0%} "
-        f"of the pairs agree, {facts['angle_degrees']:.1f}° between rays."
+        f"points in {facts['track_length']:.1f} photos each, {facts['reprojection_error_px']:.2f} "
+        f"px, {facts['pairs_agree']:.0%} of the pairs agree, {facts['angle_degrees']:.1f}° "
+        "between rays."
     )
 
 
@@ -226,7 +220,6 @@ def check(model: PhotoModel, least: float) -> None:
     if facts["angle_degrees"] < FLAT or facts["pairs_level"] > LEVEL:
         raise DataFailure(
             "the photos were taken from one place, or show one plane, which tells no depth: a "
-            "homography explains "
-            f"{facts['pairs_level']:.0%} of the pairs, rays of a point meet at "
+            f"homography explains {facts['pairs_level']:.0%} of the pairs, rays of a point meet at "
             f"{facts['angle_degrees']:.1f}°; {REMEDY}"
         )

@@ -40,7 +40,7 @@ RATIO = 0.8  # Lowe's, of the distances of the nearest and the second nearest de
 
 
 def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray) -> Path:
-    """Extract SIFT from the capture's own pixels and match given pairs [P, 2] of its views.
+    """Extract SIFT from the capture's own pixels and match pairs [P, 2] of its views.
 
     Choices: views that occur in no pair have no features either.
     """
@@ -51,10 +51,8 @@ def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray) -
 
 def with_features(job: Job, capture: Capture, settings: SfmSection, views: Sequence[int]) -> Path:
     """A database of views with SIFT from the capture's own pixels."""
-    folder, database = (
-        _write_images(job, capture, views),
-        empty_database(job.scratch / "database.db"),
-    )
+    folder = _write_images(job, capture, views)
+    database = empty_database(job.scratch / "database.db")
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "PINHOLE"
     if capture.loss_mask is not None:
@@ -68,7 +66,7 @@ def with_features(job: Job, capture: Capture, settings: SfmSection, views: Seque
 
 
 def empty_database(path: Path) -> Path:
-    """A new database in place of what may lie there."""
+    """A new database, in place of an old one."""
     pycolmap.logging.minloglevel = (
         pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
     )
@@ -141,14 +139,12 @@ def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capt
 def chosen_pairs(
     job: Job, database: Path, n: int, settings: Searched, poses: np.ndarray | None = None
 ) -> np.ndarray:
-    """Pairs of `n` views to match, int [P, 2], as `matching` of the settings says."""
+    """Pairs of `n` views to match, int [P, 2], by the setting `matching`."""
     mode = matching_mode(settings.matching, n, poses is not None)
     if mode == "posed":
         assert poses is not None
-        pairs, why = (
-            nearest_by_pose(poses, settings.n_matched),
-            (f"{settings.n_matched} nearest of each by its pose"),
-        )
+        pairs = nearest_by_pose(poses, settings.n_matched)
+        why = f"{settings.n_matched} nearest of each by its pose"
     elif mode == "sequential":
         pairs = in_sequence(_largest_descriptors(database, n), settings.n_matched)
         why = f"{IN_A_ROW} before and after each, {settings.n_matched} most alike"
@@ -187,7 +183,7 @@ def _write_images(job: Job, capture: Capture, views: Iterable[int]) -> Path:
 
 
 def _in_blocks(job: Job, items: list[Any], size: int, what: str) -> Iterator[list[Any]]:
-    """Blocks of so many items, with rate and time left: pycolmap says nothing while it works."""
+    """Blocks of so many items, with rate and time left: pycolmap reports no progress."""
     blocks = [items[at : at + size] for at in range(0, len(items), size)]
     count = 0
     for block, status in job.progress.track(blocks, len(blocks), what):

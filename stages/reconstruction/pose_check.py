@@ -19,7 +19,7 @@ from chebsplat.stages.sources.common import file_of
 log = logging.getLogger("chebsplat")
 
 MISFIT = 0.5  # pixels that the median match may miss its epipolar line by
-# times what it misses that of the pair's own fundamental matrix by: features may be coarse
+# times its distance to that of the pair's own fundamental matrix: features may be coarse
 OVER_FREE = 2.0
 SHARED = 30  # verified matches of a pair that counts
 LEAST = 6  # such pairs, without which there is no verdict
@@ -101,9 +101,8 @@ def measured(job: Job, capture: Capture, database: Path | None) -> Fit:
     pose_fit = Fit(0.0, 0.0, 0) if database is None else fit(database, capture)
     job.facts |= {"epipolar_px": pose_fit.by_poses, "epipolar_free_px": pose_fit.free}
     log.info(
-        "given poses %s the photos: matches of %d pairs miss their epipolar lines by %.2f px, "
-        "%.2f where each pair is "
-        "free (medians)%s",
+        "given poses %s the photos: matches of %d pairs miss their epipolar lines by %.2f px, %.2f "
+        "where each pair is free (medians)%s",
         "do not fit" if pose_fit.misses else "fit",
         pose_fit.n_pairs,
         pose_fit.by_poses,

@@ -31,7 +31,7 @@ MORE = 1.1  # times the photos of the best so far, that a costlier attempt must 
 HALF = 0.5  # of the photos: where a plain lens registers so many, no fisheye's is tried
 FISHEYE = "OPENCV_FISHEYE"
 FAINT = 0.002  # SIFT's peak threshold where the usual one finds too little; it costs exactness
-WIDE = 0.5  # a fisheye's focal length in longer sides, where EXIF says nothing
+WIDE = 0.5  # a fisheye's focal length in longer sides, without EXIF
 FILM = 36.0  # mm, the longer side of the frame that 35 mm equivalents refer to
 STRAY = 3.0  # pixels of the pictures that photos are reduced to
 FLATTEST = 1.5  # degrees between the rays of a point: COLMAP's own
@@ -92,8 +92,8 @@ def _matched(
 ) -> Path:
     """A database of the photos' features and matches.
 
-    Choices: photos of one size and focal length have one camera. Where EXIF tells no focal length
-      there is none before mapping, but for a fisheye's, which is not found without.
+    Choices: photos of one size and focal length have one camera. Without a focal length in EXIF
+      mapping finds it, but for a fisheye's, which needs a guess.
     """
     database = empty_database(job.scratch / "database.db")
     alike: dict[tuple[tuple[int, int], float | None, bool], list[int]] = {}

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from chebsplat.formats.points import Points
 
 LEVELS = 4  # sizes of cubes that colours choose among, each half of the one before
-# what colours of one surface differ by: squared, of channels in [0, 1], summed over the three
+# variance of the colours of one surface, of channels in [0, 1], summed over the three
 NOISE = 1e-3
 
 

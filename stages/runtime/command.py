@@ -45,7 +45,7 @@ class Job:
     watch: Stopwatch = field(default_factory=Stopwatch)
 
     def left_out(self, what: str, why: str) -> None:
-        """Record that this scene does not need `what`."""
+        """Record and log the reason for leaving out a part, `what`."""
         self.facts.setdefault("left_out", {})[what] = why
         log.info("left out: %s (%s)", what, why)
 

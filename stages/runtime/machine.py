@@ -21,7 +21,7 @@ PROCESSES = "processes.json"  # in the scratch folder of a stage that resumes
 
 @cache
 def processor() -> str:
-    """The processor's name where Linux tells it, otherwise its kind as LLVM calls it."""
+    """The processor's name by Linux, or else LLVM's name of its kind."""
     lines = CPUS.read_text().splitlines() if CPUS.exists() else []
     named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     if name := next(named, ""):
@@ -58,9 +58,7 @@ class Stopwatch:
         self.load = load()
 
     def processes(self) -> list[dict[str, Any]]:
-        """Of each process, in their order: processor, gpu, cores, threads, load at start and now,
-        seconds.
-        """
+        """processor, gpu, cores, threads, load at start and now, and seconds of each process."""
         of_machine = {
             "processor": processor(),
             "gpu": self.gpu,

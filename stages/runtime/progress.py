@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class Progress:
-    """`show` forces or forbids the bar; by default it follows whether stderr is a terminal."""
+    """`show` forces or forbids the bar; by default there is one if stderr is a terminal."""
 
     def __init__(self, show: bool | None = None, every: float = 10.0):
         self.show = (sys.stderr is not None and sys.stderr.isatty()) if show is None else show
@@ -37,8 +37,8 @@ class Progress:
             self._log.write(json.dumps(values) + "\n")
 
     def ticker(self, total: int, what: str) -> Callable[[], None]:
-        """A function to call after each of `total` things that a library counts, not a loop of
-        ours; further calls than that show nothing.
+        """A function to call after each of `total` steps of a library's loop; further calls have no
+        effect.
         """
         steps = self.track(range(total), total, what)
         next(steps, None)
@@ -51,7 +51,7 @@ class Progress:
     def track(
         self, items: Iterable[T], total: int | Callable[[], int], what: str, start: int = 0
     ) -> Iterator[tuple[T, dict[str, Any]]]:
-        """Yield (item, status); what the caller puts into `status` is shown beside rate and ETA.
+        """Yield (item, status); the caller's entries in `status` are shown beside rate and ETA.
 
         total: number of items, `start` of them done before; a function where it changes on the way.
         """

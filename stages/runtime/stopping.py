@@ -1,7 +1,7 @@
 """Ends of our processes: well, with a typed error, a crash, or by SIGINT, SIGTERM or SIGHUP.
 
 A signal raises `Stopped` in the main thread, so that nothing half made is left; a loop that can
-reach a better place within a moment defers it. Whoever cannot listen (a kernel is being compiled)
+reach a better place within a moment defers it. A process that cannot react (compiling a kernel)
 is killed by its run.
 """
 
@@ -27,7 +27,7 @@ from chebsplat.formats.files import OUTPUT, REFUSALS, explained
 log = logging.getLogger("chebsplat")
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 STREAMS = 2  # the highest number of a standard stream
-PATIENCE = 2.5  # seconds from being asked to being killed
+PATIENCE = 2.5  # seconds from the request to the kill
 KEPT = "what was finished is kept, and the same command goes on from there"
 
 
@@ -37,10 +37,10 @@ def exit_code(
     tell: Callable[[str], object] = log.error,
     raised: tuple[type[Exception], ...] = (),
 ) -> int:
-    """The door that all commands leave by: the action's code (None: 0), or that of what ends it.
+    """Run a command's action; returns its code (None: 0), or that of the error that ends it.
 
-    Args: folder: of a disk's error that names no file; tell: says a typed error or a stop; raised:
-      errors that are left to the caller, beside click's own.
+    Args: folder: of a disk's error that names no file; tell: prints a typed error or a stop;
+      raised: errors that are left to the caller, beside click's own.
     """
     try:
         with heeded(), explained(folder):
@@ -58,8 +58,8 @@ def exit_code(
 
 
 class _Output:
-    """Standard output whose refusals name it. The first is kept in `refusal`, since click tries
-    streams in silence; what comes after it is dropped.
+    """Standard output whose write errors name it. The first is stored in `refusal`, since click
+    silences errors; later output is dropped.
     """
 
     def __init__(self, stream: TextIO):
@@ -133,10 +133,8 @@ class StopRequest:
         """
         now = time.monotonic()
         if self.stop is None or now - self.since > PATIENCE:
-            self.stop, self.since = (
-                Stopped(number, f"stopped by {signal.Signals(number).name}; {KEPT}"),
-                now,
-            )
+            self.stop = Stopped(number, f"stopped by {signal.Signals(number).name}; {KEPT}")
+            self.since = now
             if not self.deferred:
                 raise self.stop
 
@@ -148,8 +146,8 @@ _request: StopRequest | None = None
 def heeded() -> Iterator[None]:
     """Signals raise `Stopped` within; one that is ignored (nohup) stays so. The outermost rules.
 
-    What breaks because a stop has come, an import that it fell into, is the stop and no crash; a
-    destructor, where nothing can be raised, says nothing of it.
+    An error that a stop causes, as in an import that it interrupts, is raised as the stop, not as a
+    crash; in a destructor, where nothing can be raised, it is silent.
     """
     global _request
     outermost = _request is None and threading.current_thread() is threading.main_thread()
@@ -192,7 +190,7 @@ def deferred() -> Iterator[StopRequest]:
 
 
 def end_itself() -> None:
-    """Ask this process to end, from a thread of its own, and kill it if it does not listen."""
+    """Ask this process to end, from another thread, and kill it if it does not react."""
     signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
     time.sleep(PATIENCE)
     os._exit(128 + signal.SIGTERM)

@@ -122,8 +122,7 @@ def check_teacher(path: Path, knowledge: Knowledge, features: Features) -> None:
     if teacher != knowledge.teacher:
         raise InputError(
             f"{path} was taught for the teacher {knowledge.teacher}, the scene has {teacher}; "
-            "teach knowledge for it "
-            "(`chebsplat knowledge teach`)"
+            "teach knowledge for it (`chebsplat knowledge teach`)"
         )
     if channels is not None and channels.notes.get("digest") != knowledge.digest:
         raise InputError(

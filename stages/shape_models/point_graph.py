@@ -219,10 +219,8 @@ def _relative(graph: Graph, rows: str, radius: float) -> str:
         "Sub", graph.add("Gather", "means", rows), graph.add("Unsqueeze", "means", whole(1))
     )
     offset = graph.add("Div", offset, number(radius))
-    normal, others = (
-        graph.add("Unsqueeze", "normals", whole(1)),
-        graph.add("Gather", "normals", rows),
-    )
+    normal = graph.add("Unsqueeze", "normals", whole(1))
+    others = graph.add("Gather", "normals", rows)
     along = dot(offset, normal)
     across = graph.add("Sub", offset, graph.add("Mul", along, normal))
     rise = graph.add("Sub", part(others, 2, 3), part(normal, 2, 3))

@@ -110,9 +110,7 @@ def up_of(poses: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def scene_unit(capture: Capture | None, means: np.ndarray) -> tuple[float, str]:
-    """Scene units of a metre, and their origin: `source` where it is metric or has depth, `extent`
-    otherwise.
-    """
+    """Scene units of a metre, by `source`, if metric or with depth, else by `extent`; and which."""
     if capture is not None and (capture.depth is not None or capture.source.get("kind") in METRIC):
         return 1 / World.read(capture.source).scale, "source"
     return room_unit(means), "extent"
