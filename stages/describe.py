@@ -16,8 +16,8 @@ from chebsplat.stages.shape_models.surfaces import Cloud, scene_unit, surface_in
 def run(job: Job) -> None:
     """Describe the shape about points of depth or of a sweep (docs/method.md, section 2).
 
-    Reads `capture` and `points`. Writes `descriptors`, of no point where a scene shows too little
-    of a surface.
+    Reads `capture` and `points`. Writes `descriptors`. They are of no point where a scene shows too
+    little of a surface.
     """
     settings = job.config.describe
     capture, points = Capture.read(job.inputs["capture"]), Points.read(job.inputs["points"])

@@ -17,8 +17,8 @@ from chebsplat.stages.shape_models.answers import inputs_of
 def run(job: Job) -> None:
     """Encode the shape about each described point (docs/method.md, section 14).
 
-    Reads `descriptors`, and the encoder of the `knowledge` that ships. Writes `encoding`, of no
-    point where there are no descriptors.
+    Reads `descriptors`, and the encoder of the `knowledge` that ships. Writes `encoding`. It is of
+    no point where there are no descriptors.
     Choices: half precision, whose error is a hundredth of the difference between points' features.
     """
     start = read_knowledge(job.inputs["start"])

@@ -32,7 +32,7 @@ from chebsplat.stages.measuring.image_quality import (
     figures_as_taken,
     frame_split,
     image_figures,
-    perceptual,
+    load_lpips,
     timing,
 )
 from chebsplat.stages.runtime.command import Job
@@ -60,7 +60,7 @@ def run(job: Job) -> None:
             "pass those of one scene"
         )
     lpips = (
-        perceptual(Path(settings.lpips_weights).expanduser()) if settings.lpips_weights else None
+        load_lpips(Path(settings.lpips_weights).expanduser()) if settings.lpips_weights else None
     )
     row = {name: view for view, name in enumerate(capture.names)}
     evaluated = capture.is_test if not protocol.ON_TRAINING else ~capture.is_test

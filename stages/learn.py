@@ -48,8 +48,8 @@ def run(job: Job) -> None:
     """The lesson of a scene, and the evidence by which later scenes trust it.
 
     Reads `capture`, `points`, `descriptors`, `encoding`, `features`, and the `knowledge` that
-    ships, against which it is judged. Writes `lesson`, empty where a scene shows too little of a
-    surface.
+    ships, against which it is judged. Writes `lesson`. It is empty where a scene shows too little
+    of a surface.
     Choices: trust is measured against what ships, not against what earlier lessons have made of
       it: so it does not depend on the order in which scenes are learned.
     """

@@ -64,7 +64,7 @@ def run(job: Job) -> None:
         raise DataFailure(
             f"only {n} points were found, at least 16 are needed; add views with more overlap"
         )
-    off = {} if "reprojection_error_px" in cloud["notes"] else missed(capture, cloud)
+    off = {} if "reprojection_error_px" in cloud["notes"] else check_points(capture, cloud)
     if depths is not None:
         behind = backdrop(capture, cloud)
         cloud = joined(cloud, behind) | {
@@ -90,7 +90,7 @@ def run(job: Job) -> None:
     ).write(job.out)
 
 
-def missed(capture: Capture, cloud: Cloud) -> dict[str, float]:
+def check_points(capture: Capture, cloud: Cloud) -> dict[str, float]:
     """Error of points that come from no matches: `depth_error`, the median of their distance from
     the depth of training views, as a share of it; without depth `covered`, the share of the photos'
     cells that hold a point.

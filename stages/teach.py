@@ -66,7 +66,7 @@ def run(job: Job) -> None:
         raise InputError(
             f"{job.inputs['channels']} is of another teacher than {teacher.path}; pass its own"
         )
-    rooms = prepared(job, settings, channels.matrix)
+    rooms = prepare_rooms(job, settings, channels.matrix)
     lessons, tested = rooms[: settings.n_rooms], rooms[settings.n_rooms :]
     words, embeddings = vocabulary(teacher, list(CLASS_NAMES), channels.matrix)
     named = match_names(list(CLASS_NAMES), words)
@@ -104,7 +104,7 @@ def run(job: Job) -> None:
             scaled_novelty(novelty(one, scale, shape_basis), one.spread()) for one in sums
         )
         if -1 not in named:
-            card[name] = measured(
+            card[name] = measure_accuracy(
                 [z @ shape_map[:, : len(classes[0])] for z in encoded], of, classes
             )
     card["novelty"] = newest
@@ -181,7 +181,7 @@ def vocabulary(
     return words, text_embeddings(words, teacher) @ matrix
 
 
-def prepared(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[list[Room]]:
+def prepare_rooms(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[list[Room]]:
     """Rooms to train on, then rooms held out: clean, worn, half seen, swept; a process a thread."""
     seeds = [*KNOWLEDGE[: settings.n_rooms], *KNOWLEDGE[-settings.n_held_out :]]
     folder = job.scratch / "rooms"
@@ -226,7 +226,7 @@ def train_encoder(job: Job, settings: TeachSection, examples: list[Example]) -> 
     return encoder.eval()
 
 
-def measured(
+def measure_accuracy(
     answers: Sequence[np.ndarray], rooms: Sequence[Room], embeddings: np.ndarray
 ) -> dict[str, float]:
     """Accuracy of labels on rooms held out: by the teacher's averages, by shape, and by both."""

@@ -111,7 +111,7 @@ def enlarged(view: View, factor: float) -> View:
     return View(K, view.viewmat, math.ceil(view.width * factor), math.ceil(view.height * factor))
 
 
-def perceptual(path: Path) -> Lpips:
+def load_lpips(path: Path) -> Lpips:
     """LPIPS of a weights file, .safetensors or a .pth of tensors alone. Raises InputError."""
     if not path.is_file():
         raise InputError(f"{path} is missing; correct evaluate.lpips_weights")

@@ -110,7 +110,7 @@ def misplaced(graph: Pairs, most: float = CONTRADICTED) -> list[int]:
     return [graph.images[k] for k in np.flatnonzero(~survivors)]
 
 
-def judged(
+def judge_model(
     model: pycolmap.Reconstruction,
     graph: Pairs,
     n_photos: int,

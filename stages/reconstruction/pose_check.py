@@ -59,8 +59,8 @@ def wants_adjustment(
         return settings.poses == "adjusted"
     if _exact(capture) or (capture.tracks is not None and len(capture.tracks)):
         return False
-    return measured(
-        job, capture, probed(job, capture, settings) if database is None else database
+    return check_poses(
+        job, capture, match_probe(job, capture, settings) if database is None else database
     ).misses
 
 
@@ -83,7 +83,7 @@ def wants_lines(
     ):
         return False
     match_freely(job, database, _some_of(pairs), settings)
-    match_fit = measured(job, capture, database)
+    match_fit = check_poses(job, capture, database)
     return match_fit.tells and match_fit.by_poses <= MISFIT
 
 
@@ -96,7 +96,7 @@ def _some_of(pairs: np.ndarray) -> np.ndarray:
     return np.asarray(pairs[np.unique(np.linspace(0, len(pairs) - 1, PROBED).round().astype(int))])
 
 
-def measured(job: Job, capture: Capture, database: Path | None) -> Fit:
+def check_poses(job: Job, capture: Capture, database: Path | None) -> Fit:
     """`fit` of the matches of a database, in the facts and the log."""
     pose_fit = Fit(0.0, 0.0, 0) if database is None else fit(database, capture)
     job.facts |= {"epipolar_px": pose_fit.by_poses, "epipolar_free_px": pose_fit.free}
@@ -112,7 +112,7 @@ def measured(job: Job, capture: Capture, database: Path | None) -> Fit:
     return pose_fit
 
 
-def probed(job: Job, capture: Capture, settings: SfmSection) -> Path | None:
+def match_probe(job: Job, capture: Capture, settings: SfmSection) -> Path | None:
     """A database of PROBED pairs of neighbouring views and large features; None without pairs."""
     assert capture.cam_from_world is not None
     pairs = nearest_by_pose(capture.cam_from_world, settings.n_matched)

@@ -148,7 +148,7 @@ def _mapped(
         model.deregister_frame(model.images[identity].frame_id)
     mapped_error = model.compute_mean_reprojection_error()
     _refine(model)
-    judged = judge.judged(
+    judged = judge.judge_model(
         model, judge.pairs(model, database), len(shots), sizes[1:], len(misplaced), mapped_error
     )
     return _collected(model, shots, judged)

@@ -48,9 +48,9 @@ class Trials:
         )
         self.windows = [network.middle(image, (min(heights), min(widths))) for image in images]
         self.turned = False
-        self.plain = self.fed(self.own)
+        self.plain = self.outputs(self.own)
 
-    def fed(
+    def outputs(
         self, teacher: TeacherModel, change: Callable[[np.ndarray], np.ndarray] | None = None
     ) -> np.ndarray:
         """Values [V, L, h, w] of the windows after `change`, by a teacher's mean, std, order."""
@@ -68,10 +68,10 @@ class Trials:
             )
         return values.swapaxes(2, 3) if self.turned else values
 
-    def informed(self, teacher: TeacherModel) -> tuple[float, np.ndarray]:
+    def measure(self, teacher: TeacherModel) -> tuple[float, np.ndarray]:
         """Information, nats, that photos and their changed middles share; the values."""
-        plain = self.plain if teacher == self.own else self.fed(teacher)
-        changed = self.fed(teacher, closer)[..., ::-1]
+        plain = self.plain if teacher == self.own else self.outputs(teacher)
+        changed = self.outputs(teacher, closer)[..., ::-1]
         inner = [slice(n // INNER, n - n // INNER) for n in plain.shape[2:]]
         there = plain[:, :, inner[0], inner[1]]
         rows, columns = (
@@ -82,7 +82,7 @@ class Trials:
         return information(soft(there, spread(plain)), soft(same, spread(changed))), plain
 
 
-def tried(
+def try_variants(
     network: TeacherInference, images: list[np.ndarray], names: list[str], embeddings: np.ndarray
 ) -> list[tuple[str, str]]:
     """(topic, finding) on the map's layout, the range and order of colours, the names of classes.
@@ -111,7 +111,7 @@ def tried(
 
 def layout_of(trials: Trials) -> str:
     """Finding on the map's layout, by a change of the photos' top right; turns a transposed map."""
-    before, after = trials.plain, trials.fed(trials.own, top_right_inverted)
+    before, after = trials.plain, trials.outputs(trials.own, top_right_inverted)
     deviation = spread(before)
     moved = changes(soft(before, deviation), soft(after, deviation))
     second, first = np.argsort(moved)[-2:]
@@ -132,13 +132,13 @@ def layout_of(trials: Trials) -> str:
 def range_of(trials: Trials) -> tuple[str, TeacherModel, np.ndarray]:
     """Finding on mean and std; the teacher with the most informative ones; its values."""
     teacher = trials.own
-    own, plain = trials.informed(teacher)
+    own, plain = trials.measure(teacher)
     candidates = []
     for name, (mean, std) in RANGES.items():
         if not np.allclose((mean, std), (teacher.mean, teacher.std), rtol=0.05):
             fed = replace(teacher, mean=mean, std=std)
             with suppress(DataFailure):  # a range that makes it overflow
-                candidates.append((*trials.informed(fed), name, fed))
+                candidates.append((*trials.measure(fed), name, fed))
     most, values, name, best = max(
         candidates, key=lambda of: of[0], default=(0.0, plain, "", teacher)
     )
@@ -167,7 +167,7 @@ def order_of(trials: Trials, teacher: TeacherModel, plain: np.ndarray) -> str:
     deviation = spread(plain)
     own, swapped = (
         entropy(soft(values, deviation))
-        for values in (plain, trials.fed(replace(teacher, order=other)))
+        for values in (plain, trials.outputs(replace(teacher, order=other)))
     )
     if own > LESS * swapped:
         verdict = f"{other} is surer: {swapped:.3f} nats of doubt, {own:.3f} of {teacher.order}"

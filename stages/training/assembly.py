@@ -182,7 +182,7 @@ def model_of(
     """
     torch.manual_seed(train.seed)
     if train.start:
-        initial = started(Path(train.start), points, train, capture)
+        initial = read_start(Path(train.start), points, train, capture)
     else:
         assert train.opacity is not None
         initial = initial_gaussians(points.means, points.colors, points.covariances, train.opacity)
@@ -216,7 +216,7 @@ def start_features(
     return int(lifted.features.any(1).sum())
 
 
-def started(
+def read_start(
     ply: Path, points: Points, train: TrainSection, capture: Capture | None
 ) -> dict[str, Tensor]:
     """Raw parameters of a splat's Gaussians, with SH bands, in the frame of the scene's cameras.

@@ -43,7 +43,7 @@ def follow(job: Job, trainer: Trainer) -> list[dict[str, float]]:
         for figures, status in rounds:
             since.append(figures)
             if trainer.step % train.report_every == 0 or trainer.share >= 1:
-                trace.append(measured(trainer, since, watched))
+                trace.append(trace_row(trainer, since, watched))
                 since = []
                 job.progress.record(**trace[-1])
             losses.append(figures["loss"])
@@ -61,7 +61,7 @@ def follow(job: Job, trainer: Trainer) -> list[dict[str, float]]:
     return [{k: row.get(k, 0.0) for k in columns} for row in trace]
 
 
-def measured(
+def trace_row(
     trainer: Trainer, since: list[dict[str, float | Tensor]], watched: list[int]
 ) -> dict[str, float]:
     """A row of the trace: figures of steps since the row before, PSNR of watched training views."""
