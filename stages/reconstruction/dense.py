@@ -139,7 +139,7 @@ def depth_of_photos(
     z: list[np.ndarray],
     progress: Progress | None = None,
 ) -> np.ndarray:
-    """Depth f32 [V, h, w] of photos, 0 unknown: by a plane sweep, and by planes without texture.
+    """Depth f32 [V, h, w] of photos by a plane sweep, by planes where texture lacks; 0 unknown.
 
     Args: colors f32 [V, h, w, 3] in [0, 1]; valid [V, h, w]: 1 where a pixel counts; Ks [V, 3, 3]
       in its pixels; poses [V, 4, 4]; z: of each photo, the depths of some points in it.

@@ -256,7 +256,7 @@ def in_sequence(descriptors: list[np.ndarray], n_neighbors: int) -> np.ndarray:
 
 
 def nearest(cost: np.ndarray, count: int) -> np.ndarray:
-    """Pairs of each view with its `count` others of least finite cost [V, V], of either one's."""
+    """Pairs in which either view is among the other's `count` of least finite cost [V, V]."""
     cost = cost.copy()
     np.fill_diagonal(cost, np.inf)
     order = np.argsort(cost, 1, kind="stable")[:, :count]
