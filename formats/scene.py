@@ -1,6 +1,4 @@
-"""`scene/3`: the exported scene: PLY for viewers, ragged arrays for us, a label dictionary and a
-summary.
-"""
+"""`scene/3`: the exported scene: PLY for viewers, ragged arrays, label names and a summary."""
 
 from __future__ import annotations
 
@@ -27,9 +25,8 @@ class Scene:
     """N Gaussians sorted by SH degree, stably; raw float32 parameters as in `gaussians/2`.
 
     parameters: `means`, `log_scales`, `quats`, `logit_opacities`, `sh0` [N,1,3], `shN` [N,15,3]
-      (zero above a
-                Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics `features`
-                [N,C].
+      (zero above a Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics
+      `features` [N,C].
     cameras:    of the views it can be evaluated on.
     order:      i64 [N], row of each Gaussian in the checkpoint.
     labels:     i32 [N] class index, -1 none; None without semantics. label_names, label_embeddings
@@ -51,10 +48,9 @@ class Scene:
         """Fill the directory that `artifact.publish` yields; returns bytes by part.
 
         Choices: `scene.ply` is trimmed to the highest degree in use; `scene_d<k>.ply` hold each
-          degree apart, each
-        valid on its own; all are in the source's world. Features are 16-bit fixed point: as small
-        as halves, 20 times as exact. Degrees are stored in the checkpoint's order, which they then
-        tell.
+          degree apart, each valid on its own; all are in the source's world. Features are 16-bit
+          fixed point: as small as halves, 20 times as exact. Degrees are stored in the checkpoint's
+          order, which they then tell.
         """
         p, degrees, world = self.parameters, self.parameters["degrees"], World.read(self.summary)
         unsorted = np.empty_like(degrees)
@@ -108,9 +104,7 @@ class Scene:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """The exported scene at `path`, all in memory. Raises InputError naming the damaged file
-        and the remedy.
-        """
+        """The exported scene at `path`, all in memory. Raises InputError naming file and remedy."""
         path = Path(path)
         stored = RaggedScene.read(path)
         order = np.argsort(stored.degrees, kind="stable")
@@ -146,12 +140,10 @@ class Scene:
 
 @dataclass
 class RaggedScene(Record):
-    """`Scene` as stored: a Gaussian pays only for the SH bands that it keeps, and for features in
-    16-bit fixed point.
+    """`Scene` as stored: SH bands up to each Gaussian's degree, features in 16-bit fixed point.
 
     All but `degrees` are in order of degree. sh1, sh2, sh3: rows of the Gaussians that keep the
-      band. steps: what an
-    integer of `features` counts.
+    band. steps: the unit of `features`.
     """
 
     SCHEMA: ClassVar[str] = Scene.SCHEMA

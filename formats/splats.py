@@ -1,6 +1,4 @@
-"""Splats as other programs keep them: PLY, Niantic's SPZ, .splat, and the folder that 3DGS
-writes.
-"""
+"""Splats of other programs: PLY, Niantic's SPZ, .splat, and the folder that 3DGS writes."""
 
 from __future__ import annotations
 
@@ -14,7 +12,7 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats.files import regular
 from chebsplat.formats.packed import C0
-from chebsplat.formats.ply import REST, read_ply, usable
+from chebsplat.formats.ply import REST, drop_unusable, read_ply
 from chebsplat.formats.world import HERE, World
 
 READ = (".ply", ".spz", ".splat")
@@ -23,33 +21,30 @@ REMEDY = "export it as PLY, for example with SuperSplat"
 LARGEST = 512 << 20  # bytes of a .splat, and of an SPZ unpacked: 8 million Gaussians of degree 3
 # magic, version, Gaussians, degree, bits of a coordinate's fraction, flags
 SPZ = struct.Struct("<4sIIBBBx")
-# SPZ looks along -z, y up; these change their sign with y and z, of the 15 coefficients beyond band
-# 0
+# SPZ looks along -z, y up: signs of the 15 coefficients beyond band 0 when y and z are negated
 TURNED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 
 
 def is_splat(name: str) -> bool:
-    """Whether a path is called like a splat, or is a folder as 3DGS writes it."""
+    """True for a path that is named like a splat, or is a folder as 3DGS writes it."""
     return Path(name).suffix.lower() in READ + OTHERS or os.path.isdir(
         os.path.join(name, "point_cloud")
     )
 
 
 def splat_file(path: Path) -> Path:
-    """The file of a splat: itself, or of 3DGS' output folder the PLY of the last iteration. Raises
-    InputError.
-    """
+    """The file of a splat, or the last PLY of 3DGS' output folder. Raises InputError."""
     if os.path.isdir(path):
-        found = [
+        iterations = [
             ply
             for ply in path.glob("point_cloud/iteration_*/point_cloud.ply")
             if _iteration(ply) >= 0
         ]
-        if not found:
+        if not iterations:
             raise InputError(
                 f"{path} holds no point_cloud/iteration_*/point_cloud.ply; name the file of a splat"
             )
-        return max(found, key=_iteration)
+        return max(iterations, key=_iteration)
     if path.suffix.lower() in OTHERS:
         raise InputError(
             f"{path}: {path.suffix.lower()} is not read ({', '.join(READ)} are); {REMEDY}"
@@ -66,8 +61,7 @@ def _iteration(ply: Path) -> int:
 def read_splats(
     path: Path, world: World = HERE
 ) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
-    """Raw parameters, degree and labels, as `ply.read_ply`, of any file or folder that `splat_file`
-    takes.
+    """Raw parameters, degree and labels, as `ply.read_ply`, of any splat that `splat_file` accepts.
 
     Args:   world: to bring the Gaussians into, from that of its source.
     Raises: InputError naming the file.
@@ -78,7 +72,7 @@ def read_splats(
     if path.stat().st_size > LARGEST:
         raise InputError(f"{path} has more than the {LARGEST >> 20} MiB that are read; thin it out")
     parameters, degree = (_spz if path.suffix.lower() == ".spz" else _splat)(path)
-    parameters = usable(path, parameters)[0]
+    parameters = drop_unusable(path, parameters)[0]
     moved = {
         "means": world.inward(parameters["means"]),
         "log_scales": parameters["log_scales"] - np.log(world.scale),
@@ -195,11 +189,11 @@ def _parameters(
         logits = np.log(opacities / (1 - opacities))
     shN = np.zeros((len(means), 15, 3), np.float32)
     shN[:, : sh.shape[1]] = sh
-    found = {
+    raw = {
         "means": means,
         "log_scales": log_scales,
         "quats": quats,
         "logit_opacities": logits,
         "sh0": sh0[:, None],
     }
-    return {name: values.astype(np.float32) for name, values in found.items()} | {"shN": shN}
+    return {name: values.astype(np.float32) for name, values in raw.items()} | {"shN": shN}

@@ -1,4 +1,4 @@
-"""Plans that a command or a call from Python asks for: of a scene or a sequence, up to a stage."""
+"""Plans for a command or a call from Python: of a scene or a sequence, up to a stage."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def plans(
     planner = Planner(running=running, device=device, newer=newer, quality=quality)
     try:
         if sequence is not None:
-            return sequences.chain(planner, sequence, settings, ablation)
+            return sequences.plan_sequence(planner, sequence, settings, ablation)
         return [planner.plan(str(scene), settings, ablation)]
     finally:
         planner.save()
 
 
-def checked_stage(stage: str | None, chosen: list[Plan]) -> str | None:
-    """Raises ConfigError for a stage that does not exist or that this scene leaves out."""
+def checked_stage(stage: str | None, scene_plans: list[Plan]) -> str | None:
+    """`stage`, if the plans have it. Raises ConfigError on one that is unknown or left out."""
     if stage is None:
         return None
     if stage not in STAGES:
@@ -46,7 +46,7 @@ def checked_stage(stage: str | None, chosen: list[Plan]) -> str | None:
         raise ConfigError(
             f"no stage is called {stage}" + (f"; did you mean {near[0]}?" if near else "")
         )
-    for plan in chosen:
+    for plan in scene_plans:
         if stage not in plan.targets:
             raise ConfigError(
                 f"{plan.title} leaves out {stage}: {plan.left_out.get(stage, 'not needed')}"

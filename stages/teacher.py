@@ -59,7 +59,9 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     network = TeacherInference(teacher, n_threads(), job.device)
     if job.device == "cuda" and CUDA not in providers(job.device):
-        job.left_out("the teacher on the GPU", f"onnxruntime here has no CUDA ({GPU_REMEDY})")
+        why = f"onnxruntime here has no CUDA ({GPU_REMEDY})"
+        job.left_out("the teacher on the GPU", why)
+        log.info("the teacher runs on the CPU: %s", why)
     if teacher.guessed:
         log.info(
             "%s has no `output`: logits, as %s holds names alone", teacher.settings, teacher.labels
@@ -108,15 +110,15 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     }
     shape = (*grid, space.embeddings.shape[1])
     writer = FeatureWriter(job.scratch / "features", capture.names, shape, made_with)
-    waiting = [view for view in range(len(capture.names)) if view not in writer.done]
-    if writer.done:
+    waiting = [view for view in range(len(capture.names)) if view not in writer.finished]
+    if writer.finished:
         job.watch.go_on(job.scratch)
         log.info(
             "%d of %d views are there from a run that was stopped",
-            len(writer.done),
+            len(writer.finished),
             len(capture.names),
         )
-    for view, _ in job.progress.track(waiting, len(capture.names), "teacher", len(writer.done)):
+    for view, _ in job.progress.track(waiting, len(capture.names), "teacher", len(writer.finished)):
         name = capture.names[view]
         features = network.features(
             capture.images[view], grid, settings.scales, settings.flips, name

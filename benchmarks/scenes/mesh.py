@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from benchmarks import shared
 from chebsplat.cameras import unproject
 from chebsplat.formats.capture import Capture
-from chebsplat.formats.meshes import Mesh, cleaned, fused
+from chebsplat.formats.meshes import Mesh, clean_mesh, fuse_depth
 from chebsplat.pipelines.api import load
 from chebsplat.splats.parts import first_of_each
 from chebsplat.stages.runtime.progress import Progress
@@ -102,9 +102,9 @@ def main(arguments: Sequence[str]) -> int:
         names = [list(capture.class_names or []).index(name) for name in scene.label_names or []]
         for voxel in options.voxels:
             began, spent = time.perf_counter(), time.process_time()
-            raw = fused(open3d(), rendered, voxel, 1e3)
+            raw = fuse_depth(open3d(), rendered, voxel, 1e3)
             fusing, cleaning = time.perf_counter() - began, time.process_time()
-            mesh = cleaned(raw, options.triangles, LEAST_PART * voxel, LONGEST_HOLE, voxel)
+            mesh = clean_mesh(raw, options.triangles, LEAST_PART * voxel, LONGEST_HOLE, voxel)
             cleaning = time.process_time() - cleaning
             named = None
             if scene.label_embeddings is not None:

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.stability.case import Outcome, beside, case
-from chebsplat.formats.meshes import Frame, Mesh, fused
-from chebsplat.stages.tools.mesh import away, without_edges
+from chebsplat.formats.meshes import Frame, Mesh, fuse_depth
+from chebsplat.stages.tools.mesh import away, drop_edges
 from chebsplat.synthetic.rays import open3d
 
 HEIGHT, WIDTH, VOXEL, WALL = 30, 40, 0.05, 2.0
@@ -62,7 +62,7 @@ WALLS: dict[str, Callable[[], tuple[list[Frame], float, float]]] = {
 def walls(name: str) -> Outcome:
     """Raises ValueError without a mesh. The plain way takes each pixel for a vertex, in float32."""
     of, unit, shift = WALLS[name]()
-    mesh = fused(open3d(), of, unit * VOXEL, 10 * unit)
+    mesh = fuse_depth(open3d(), of, unit * VOXEL, 10 * unit)
     if len(mesh.triangles) < 500 or (mesh.colors != mesh.colors[0]).any():
         raise ValueError(f"{len(mesh.triangles)} triangles, or of another colour")
 
@@ -92,7 +92,7 @@ EMPTY: dict[str, Callable[[], list[Frame]]] = {
 @case("empty, {name}", name=EMPTY)
 def empty(name: str) -> Outcome:
     """Number of vertices and triangles."""
-    mesh = fused(open3d(), EMPTY[name](), VOXEL, 10.0)
+    mesh = fuse_depth(open3d(), EMPTY[name](), VOXEL, 10.0)
     return Outcome(float(len(mesh.vertices) + len(mesh.triangles)), 0.0)
 
 
@@ -113,7 +113,7 @@ def edges(unit: float, hole: float) -> Outcome:
         far = np.abs(np.diff(measured, axis=1, append=measured[:, -1:])) > 0.1
         return np.where(far | np.roll(far, 1, 1), 0, measured) / np.float32(unit)
 
-    return beside(without_edges(measured) / np.float32(unit), plainly, exact, 1e-6)
+    return beside(drop_edges(measured) / np.float32(unit), plainly, exact, 1e-6)
 
 
 def ball(n: int = 40) -> Mesh:

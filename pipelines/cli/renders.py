@@ -52,9 +52,9 @@ WORDS = click.option(
     "--what",
     default="color",
     show_default=True,
-    help="of color,labels,depth,relevancy; with commas",
+    help="color,labels,depth,relevancy, or some of these",
 )
-@click.option("--query", help="words that relevancy is of")
+@click.option("--query", help="words of the relevancy")
 @AGAINST
 @SIZE
 @click.option(
@@ -72,11 +72,9 @@ def render(
     size: str | None,
     fps: int,
     out: Path,
-    **asked: Any,
+    **of_query: Any,
 ) -> None:
-    """Render a finished SCENE along a path of cameras, as frames or a video; frames that are there
-    are kept.
-    """
+    """Render a finished SCENE along a path of cameras, as frames or a video; old frames stay."""
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.pipelines.api import load
     from chebsplat.pipelines.work.finished import artifact_of
@@ -84,9 +82,9 @@ def render(
     from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
     from chebsplat.stages.tools.frames import Shot, kinds_of, render_frames, render_video
 
-    opened, pixels, query = load(scene), size_of(size), asked["query"]
+    opened, pixels, query = load(scene), size_of(size), of_query["query"]
     kinds = kinds_of(what, opened, query is not None)
-    query_vectors = None if query is None else opened.understood(query, asked["against"])
+    query_vectors = None if query is None else opened.understood(query, of_query["against"])
     shot = Shot(kinds, read_manifest(artifact_of(scene, "export")).key, query_vectors)
     cameras = [fitted(camera, pixels) for camera in path_of(opened, path, frames, up)]
     if out.suffix == ".mp4":
@@ -108,9 +106,7 @@ def render(
 def cameras(
     scene: str, path: str, frames: int | None, up: Any, size: str | None, out: Path
 ) -> None:
-    """Write the cameras of a SCENE as COLMAP's text model, transforms.json and 3DGS'
-    cameras.json.
-    """
+    """Write a SCENE's cameras as COLMAP's text model, transforms.json and 3DGS' cameras.json."""
     from chebsplat.pipelines.api import load
     from chebsplat.stages.tools.camera_files import write_cameras
     from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
@@ -130,9 +126,7 @@ def cameras(
 @AGAINST
 @UP
 def page(scene: str, out: Path, sh: int, words: Path | None, against: list[str], up: Any) -> None:
-    """Write a finished SCENE (or a splat) as one HTML page to fly through and ask in words: no
-    server, no network.
-    """
+    """Write a finished SCENE (or a splat) as one HTML page to fly through and query."""
     _write_page(scene, out, sh, words, against, up)
 
 
@@ -157,7 +151,9 @@ def view(scene: str, sh: int, words: Path | None, against: list[str], up: Any) -
     out = out.absolute()
     _write_page(scene, out, sh, words, against, up)
     graphical = any(map(os.environ.get, ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")))
-    if not (graphical and webbrowser.open(out.as_uri())):  # without a screen it may be one of text
+    if not (
+        graphical and webbrowser.open(out.as_uri())
+    ):  # without a screen it may be a text browser
         print("no browser can be opened from here; open this file in one", file=sys.stderr)
 
 

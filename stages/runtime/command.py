@@ -20,7 +20,7 @@ from chebsplat.stages.registry import MANY, STAGES, lesson_paths
 from chebsplat.stages.runtime import config as configs
 from chebsplat.stages.runtime.device import DEVICES, name_of, resolve
 from chebsplat.stages.runtime.machine import Stopwatch
-from chebsplat.stages.runtime.progress import Progress
+from chebsplat.stages.runtime.progress import Progress, log_level
 from chebsplat.stages.runtime.stopping import exit_code
 
 log = logging.getLogger("chebsplat")
@@ -45,9 +45,9 @@ class Job:
     watch: Stopwatch = field(default_factory=Stopwatch)
 
     def left_out(self, what: str, why: str) -> None:
-        """Record and log the reason for leaving out a part, `what`."""
+        """Record that this scene does not need `what`: for the report, and the console with -v."""
         self.facts.setdefault("left_out", {})[what] = why
-        log.info("left out: %s (%s)", what, why)
+        log.debug("left out: %s (%s)", what, why)
 
 
 def command(name: str, run: Callable[[Job], None]) -> click.Command:
@@ -129,7 +129,7 @@ def publish(
     logging.basicConfig(
         stream=sys.stderr, format=line, datefmt="%H:%M:%S", level="WARNING", force=True
     )
-    log.setLevel("INFO")
+    log.setLevel(log_level())
     out, stage = out.absolute(), STAGES[name]
     if not force and artifact.is_whole(out, stage.schema):
         log.info("already there")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -12,7 +13,18 @@ from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
 log = logging.getLogger("chebsplat")
+VERBOSE = "CHEBSPLAT_VERBOSE"  # in the environment, so that a run's jobs have it, too
 T = TypeVar("T")
+
+
+def is_verbose() -> bool:
+    """True where the console shows details as well (`chebsplat -v`)."""
+    return bool(os.environ.get(VERBOSE))
+
+
+def log_level() -> str:
+    """The level of our log on the console."""
+    return "DEBUG" if is_verbose() else "INFO"
 
 
 class Progress:

@@ -1,6 +1,4 @@
-"""Cameras to render a scene from: its capture's, an orbit among them, or those of a file; in any
-size.
-"""
+"""Cameras to render a scene from: its capture's, an orbit or path through them, or a file's."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ def path_of(
     Args:   n_frames: of the orbit (None: 120), or of a path through the cameras (None: no path);
       up: of the orbit.
     Raises: ConfigError if it is none of these, or up is given of another path than an orbit;
-      InputError if the file's cameras cannot be used.
+      InputError if the file's cameras are unusable.
     """
     if path == "orbit":
         poses = np.stack([camera.cam_from_world for camera in scene.cameras])
@@ -52,10 +50,9 @@ def path_of(
 
 
 def orbit(cameras: list[Camera], n_frames: int, up: np.ndarray | None = None) -> list[Camera]:
-    """A round about what the cameras look at, on the ellipse that they themselves lie about,
-    upright.
+    """An upright orbit around the cameras' point of focus, on the ellipse that they lie on.
 
-    Args: up: unit [3]; None: as the cameras were held.
+    Args: up: unit [3]; None: the cameras' own.
     Choices: the ellipse has the centre and the spread of the cameras in the plane across their
       common up; all frames look at the point that is nearest to the cameras' axes, in least
       squares; where axes are parallel, at the mean of what lies before the cameras at the distance
@@ -72,13 +69,13 @@ def orbit(cameras: list[Camera], n_frames: int, up: np.ndarray | None = None) ->
     flat = (eyes - middle) @ turn[:2].T
     spread, axes = np.linalg.eigh(flat.T @ flat / len(flat))
     away = np.linalg.norm(target - middle)
-    least = 0.1 * float(away) or 1.0  # cameras in one place or on a line go round, too
+    least = 0.1 * float(away) or 1.0  # also for cameras in one place or on a line
     radii = np.maximum(np.sqrt(2 * spread.clip(0)), least)
     angles = np.arange(n_frames) * (2 * np.pi / n_frames)
     round_ = np.stack([radii[0] * np.cos(angles), radii[1] * np.sin(angles)], 1) @ axes.T
     places = middle + round_ @ turn[:2]
     return [
-        replace(cameras[0], name=f"orbit_{k:04d}", cam_from_world=looking(place, target, turn[2]))
+        replace(cameras[0], name=f"orbit_{k:04d}", cam_from_world=look_at(place, target, turn[2]))
         for k, place in enumerate(places)
     ]
 
@@ -110,9 +107,7 @@ def between(keys: list[Camera], n_frames: int) -> list[Camera]:
 
 
 def focus(eyes: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """The point [3] nearest to lines from `eyes` [V, 3] along `ahead` [V, 3] (unit), in least
-    squares.
-    """
+    """The point [3] nearest to lines from `eyes` [V, 3] along unit `ahead` [V, 3]."""
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
     total = across.sum(0)
     if np.linalg.eigvalsh(total)[0] < 1e-3 * len(eyes):
@@ -121,10 +116,8 @@ def focus(eyes: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     return np.linalg.solve(total, np.einsum("vij,vj->i", across, eyes))
 
 
-def looking(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """cam_from_world [4, 4], OpenCV's axes, of a camera at `eye` that looks at `target`, its top
-    towards `up`.
-    """
+def look_at(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """cam_from_world [4, 4], OpenCV's axes, of an upright camera at `eye` towards `target`."""
     forward = target - eye
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, up)
@@ -138,9 +131,7 @@ def looking(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def fitted(camera: Camera, size: tuple[int, int] | None) -> Camera:
-    """The camera in `size` (width, height), all of its view within; what another shape adds is
-    shown at the sides.
-    """
+    """The camera in `size` (width, height) with its whole view; another shape adds to the sides."""
     if size is None:
         return camera
     width, height = size

@@ -15,7 +15,10 @@ from benchmarks import raster
 from benchmarks.training import cost
 from chebsplat.stages.settings import TeachSection
 
-SETTINGS = "teacher.kind=embedded,knowledge.start=shipped,train.steps=60,evaluate.timing_repeats=1,sfm.max_points=6000"
+SETTINGS = (
+    "teacher.kind=embedded,knowledge.start=shipped,train.steps=60,evaluate.timing_repeats=1,"
+    "sfm.max_points=6000"
+)
 # of a finished toy scene: {work}, its folder of links, and {name}; {photos}: folder of a capture
 SMALLEST = {
     "raster": "--rounds 1",
@@ -102,8 +105,9 @@ def test_a_benchmark_runs_to_its_end_at_its_smallest_size(name, work, tmp_path, 
     assert name in PRINT_ALONE or list((tmp_path / "out").glob("*.csv"))
 
 
-HELD = {"torch, 4 threads": 100.0, "cpu, 4 threads": 4.0, "cpu, 1 thread": 12.0, "cpu, 3 channels": 3.0,
-        "cpu, 100k": 6.0, "training step, 3 colors": 10.0, "training step, 32 features by cell": 12.0}  # fmt: skip
+HELD = {"torch, 4 threads": 100.0, "cpu, 4 threads": 4.0, "cpu, 1 thread": 12.0,
+        "cpu, 3 channels": 3.0, "cpu, 100k": 6.0, "training step, 3 colors": 10.0,
+        "training step, 32 features by cell": 12.0}  # fmt: skip
 
 
 @pytest.mark.parametrize(

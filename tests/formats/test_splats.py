@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 from scipy.special import expit, logit
 from shared import gaussian_parameters
 
-import chebsplat.kernels.jit  # noqa: F401  # gsply runs on numba too: the threading layer is chosen first
+import chebsplat.kernels.jit  # noqa: F401  # chooses the threading layer before gsply's numba
 from chebsplat.errors import InputError
 from chebsplat.formats import ply
 from chebsplat.formats.splats import READ, is_splat, read_splats
@@ -59,7 +59,8 @@ def test_spz_of_gsply_is_turned_into_the_axes_of_a_ply(tmp_path, degree):
     p = given(degree)
     theirs = gsply.GSData(
         means=p["means"], scales=p["log_scales"], quats=p["quats"], opacities=p["logit_opacities"],
-        sh0=p["sh0"][:, 0], shN=p["shN"][:, : ply.REST[degree]], masks=None, mask_names=None, _base=None,
+        sh0=p["sh0"][:, 0], shN=p["shN"][:, : ply.REST[degree]], masks=None, mask_names=None,
+        _base=None,
     )  # fmt: skip
     gsply.write_spz(tmp_path / "a.spz", theirs)
     found, found_degree, labels = read_splats(tmp_path / "a.spz")
@@ -123,18 +124,12 @@ def test_a_splat_of_32_bytes_a_gaussian_reads(tmp_path):
     ("a.SOG", b"any", r"\.sog is not read \(\.ply, \.spz, \.splat are\)"),
     ("a.splat", bytes(33), "no multiple of 32"),
     ("a.spz", b"any", "is cut or no SPZ"),
-    ("a.spz", struct.pack("<4sIIBBBx", b"NGSP", 4, 1, 0, 12, 0) + bytes(16), r"\(b'NGSP', version 4\); "
-                                                                             r""
-                                                                             r""
-                                                                             r"export"),
-    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 1, 1, 0, 12, 0), mtime=0), "no SPZ of version 2 or "
-                                                                                         ""
-                                                                                         ""
-                                                                                         "3"),
-    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 3, 2**32 - 1, 3, 12, 0), mtime=0), "is cut, or has "
-                                                                                                 ""
-                                                                                                 ""
-                                                                                                 "more"),
+    ("a.spz", struct.pack("<4sIIBBBx", b"NGSP", 4, 1, 0, 12, 0) + bytes(16),
+     r"\(b'NGSP', version 4\); export"),
+    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 1, 1, 0, 12, 0), mtime=0),
+     "no SPZ of version 2 or 3"),
+    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 3, 2**32 - 1, 3, 12, 0), mtime=0),
+     "is cut, or has more"),
     ("a.spz", gzip.compress(bytes(9), mtime=0)[:-9], "no SPZ"),
 ])  # fmt: skip
 def test_what_is_no_splat_that_is_read_says_what_to_do(tmp_path, name, content, word):

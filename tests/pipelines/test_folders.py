@@ -37,7 +37,7 @@ def test_folders_of_one_name_do_not_share_their_links_and_are_found_again(tmp_pa
     assert [finished.scene_folder(f"{folder}").name for folder in places] == titles
     listed = {title: source for title, source, *_ in inventory.scenes()}
     assert listed == {title: str(folder) for title, folder in zip(titles, places, strict=True)}
-    assert store.unnamed() == []  # nothing was taken over
+    assert store.list_unreferenced() == []  # nothing was taken over
     assert Planner().plan(f"{places[0]}/", "train.steps=5").title == f"{titles[0]}@train.steps=5"
 
 

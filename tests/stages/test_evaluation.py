@@ -204,7 +204,8 @@ def test_a_finer_view_is_blurred_as_what_was_trained_on(toy):
 def test_views_of_capture_and_teacher_in_another_order_change_no_figure(toy, tmp_path):
     rng = np.random.default_rng(0)
     capture, features = Capture.read(toy["ingest"]), Features.read(toy["teacher"])
-    for record, parts in ((capture, ("images", "depth", "labels", "Ks", "cam_from_world", "is_test")),
+    for record, parts in ((capture,
+                           ("images", "depth", "labels", "Ks", "cam_from_world", "is_test")),
                           (features, ("features", "pseudo_labels", "confidence"))):  # fmt: skip
         order = rng.permutation(len(record.names))
         for part in parts:
@@ -295,7 +296,8 @@ def test_a_scannet_scene_runs_from_its_folder_to_the_figures_of_scannet_open(tmp
     )
     folder = tmp_path / "scene0000_00"
     layouts.write_scannet_sg(folder, fields)
-    config = changed(source={"kind": "scannet", "path": str(folder)}, ingest={"protocol": "scannet-open"},
+    config = changed(source={"kind": "scannet", "path": str(folder)},
+                     ingest={"protocol": "scannet-open"},
                      scene={"name": "scene0000_00"})  # fmt: skip
     made = {}
     for stage in ("ingest", "sfm", "teacher", "describe", "train", "export", "evaluate", "report"):

@@ -106,7 +106,9 @@ def test_a_resumed_stage_has_the_seconds_of_all_its_processes(toy, tmp_path, mon
     )
     monkeypatch.setattr(saves, "SECONDS", 0.0)
     with monkeypatch.context() as patched:
-        stopped_after(patched, *{"train": (saves.Saves, "offer", 5), "teacher": (machine.Stopwatch, "keep", 2),
+        stopped_after(patched,
+                      *{"train": (saves.Saves, "offer", 5),
+                        "teacher": (machine.Stopwatch, "keep", 2),
                                  "teach": (machine.Stopwatch, "keep", 1)}[stage])  # fmt: skip
         assert run_stage(stage, out, inputs, config) == Stopped(15, "").exit_code
     kept = tmp_path / f".part-{stage}" / machine.PROCESSES

@@ -113,8 +113,10 @@ def wall():
     K = np.array([[20.0, 0, 10], [0, 20.0, 8], [0, 0, 1]])
     labels = np.tile(np.where(np.arange(20) < 10, 0, 1).astype(np.int16), (3, 16, 1))
     return Capture(
-        ["0", "1", "2"], np.zeros((3, 16, 20, 3), np.uint8), np.tile(K, (3, 1, 1)), np.tile(np.eye(4), (3, 1, 1)),
-        np.array([False, False, True]), np.full((3, 16, 20), 2, np.float32), labels, class_names=["a", "b"],
+        ["0", "1", "2"], np.zeros((3, 16, 20, 3), np.uint8), np.tile(K, (3, 1, 1)),
+        np.tile(np.eye(4), (3, 1, 1)),
+        np.array([False, False, True]), np.full((3, 16, 20), 2, np.float32), labels,
+        class_names=["a", "b"],
     )  # fmt: skip
 
 

@@ -17,7 +17,9 @@ from chebsplat.formats.packed import Packed, unpack
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
 from chebsplat.pipelines.cli import main
-from tests.formats.test_readers import CONVERSIONS, GRID, packages, transform  # noqa: F401  # a fixture among them
+
+# packages is a fixture
+from tests.formats.test_readers import CONVERSIONS, GRID, packages, transform  # noqa: F401
 from tests.stages.tools.test_page import held_in
 
 SCALE, SHIFT = 3.7, np.array([120.0, -45.0, 18.0])

@@ -273,7 +273,7 @@ def test_a_study_of_one_machine_bewares_of_nothing(tmp_path):
     assert "C, 2 threads" in page and "beware" not in page
 
 
-def test_scannet_opens_scenes_are_summed_and_those_of_scannet_closed_averaged_before_seeds_are_compared(
+def test_scannet_open_sums_its_scenes_and_scannet_closed_averages_before_seeds_are_compared(
     tmp_path,
 ):
     # truth and prediction of wall and floor, in pixels           alone            summed, as

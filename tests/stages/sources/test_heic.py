@@ -110,7 +110,8 @@ def test_blurred_photos_are_counted_and_named():
 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "kind", "least", "most"), [("redkitchen", "seven_scenes", 8, 16),
-                                                             ("house_kitchen", "colmap", 0, 0)])  # fmt: skip
+                                                             ("house_kitchen", "colmap", 0,
+                                                              0)])  # fmt: skip
 def test_a_hand_held_sensor_has_blurred_frames_and_a_rendered_house_none(name, kind, least, most):
     fields = ingest.read(name, SourceSection(kind=kind, path=str(data(name))), IngestSection())
     n = int((ingest.blur_note(fields) or "0").split()[0])

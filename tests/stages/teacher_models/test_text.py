@@ -67,8 +67,10 @@ def test_a_plural_takes_its_singular_and_says_so(teacher, name, row, caplog):
 
 @pytest.mark.parametrize(
     ("name", "form"),
-    [("AirConditioner", "air conditioner"), ("chair_02", "chair"), ("tvStand3", "tv stand"), ("TVStands", "tv stand"),
-     ("office chair", "chair"), ("OfficeChairs", "chair"), ("stand by_3", "by"), ("9-11", None), ("", None)],
+    [("AirConditioner", "air conditioner"), ("chair_02", "chair"), ("tvStand3", "tv stand"),
+     ("TVStands", "tv stand"),
+     ("office chair", "chair"), ("OfficeChairs", "chair"), ("stand by_3", "by"), ("9-11", None),
+     ("", None)],
 )  # fmt: skip
 def test_a_label_is_found_by_the_words_it_is_made_of_and_then_by_the_last(name, form):
     known = ["stand", "tv stand", "air conditioner", "conditioner", "by", "chair"]
@@ -207,7 +209,8 @@ def test_label_sets_keep_the_order_that_their_protocols_count_by():
         for name in ("ade20k", "scannet20")
     )
     assert {k: ade[k - 1] for k in (1, 4, 15, 29, 40, 58, 90, 150)} == {
-        1: "wall", 4: "floor", 15: "door", 29: "rug", 40: "cushion", 58: "pillow", 90: "television", 150: "flag"
+        1: "wall", 4: "floor", 15: "door", 29: "rug", 40: "cushion", 58: "pillow", 90: "television",
+        150: "flag"
     }  # fmt: skip
     assert (scannet[0], scannet[10], scannet[11], len(scannet)) == (
         "other",

@@ -21,7 +21,8 @@ from chebsplat.pipelines.cli import main
 
 EMBEDDINGS = {
     "chair": [1, 0, 0, 0, 0, 0], "sofa": [0.8, 0.6, 0, 0, 0, 0], "wall": [0, 0, 1, 0, 0, 0],
-    "seat": [0.9, 0.4, 0, 0, 0.17, 0], "object": [0.3, 0, 0.3, 0.9, 0, 0], "things": [0, 0.3, 0.2, 0.9, 0, 0.2],
+    "seat": [0.9, 0.4, 0, 0, 0.17, 0], "object": [0.3, 0, 0.3, 0.9, 0, 0],
+    "things": [0, 0.3, 0.2, 0.9, 0, 0.2],
     "stuff": [0, 0, 0.3, 0.95, 0, 0], "texture": [0, 0, 0.5, 0.87, 0, 0],
 }  # fmt: skip
 LABELS = ["chair", "sofa", "wall"]
@@ -49,9 +50,12 @@ def write_toy(folder, teacher=None):
     known = vectors(LABELS) if teacher is None else channels.embed(vectors(LABELS))
     n = len(means)
     parameters = {
-        "means": means, "log_scales": np.full((n, 3), -1.6, np.float32), "quats": np.eye(4, dtype=np.float32)[[0] * n],
-        "logit_opacities": np.full(n, 4, np.float32), "sh0": rng.normal(0, 0.3, (n, 1, 3)).astype(np.float32),
-        "shN": np.zeros((n, 15, 3), np.float32), "degrees": np.zeros(n, np.uint8), "features": known[labels],
+        "means": means, "log_scales": np.full((n, 3), -1.6, np.float32),
+        "quats": np.eye(4, dtype=np.float32)[[0] * n],
+        "logit_opacities": np.full(n, 4, np.float32),
+        "sh0": rng.normal(0, 0.3, (n, 1, 3)).astype(np.float32),
+        "shN": np.zeros((n, 15, 3), np.float32), "degrees": np.zeros(n, np.uint8),
+        "features": known[labels],
     }  # fmt: skip
     K = np.array([[40, 0, SIZE[1] / 2], [0, 40, SIZE[0] / 2], [0, 0, 1]], float)
     views, Ks, poses = ["a.png", "b.png"], np.stack([K, K]), np.stack([np.eye(4)] * 2)
@@ -68,7 +72,8 @@ def write_toy(folder, teacher=None):
             str(teacher),
         )
     features = Features(
-        views, np.zeros((2, 2, 2, known.shape[1]), np.float16), LABELS, known, convention=convention,
+        views, np.zeros((2, 2, 2, known.shape[1]), np.float16), LABELS, known,
+        convention=convention,
         channels=None if teacher is None else channels,
     )  # fmt: skip
     published(folder / "teacher", features, config={"teacher": {"model": model}})

@@ -241,7 +241,7 @@ def ring(n=12, tilt=0.3):
     K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
     for angle in np.arange(n) * 2 * np.pi / n:
         eye = np.array([1 + 3 * np.cos(angle), 2 + 3 * np.sin(angle), 3 * tilt])
-        pose = camera_paths.looking(eye, np.array([1.0, 2, 0]), np.array([0, 0, 1.0]))
+        pose = camera_paths.look_at(eye, np.array([1.0, 2, 0]), np.array([0, 0, 1.0]))
         yield Camera(f"{angle:.2f}", K, pose, 100, 80)
 
 

@@ -165,8 +165,10 @@ def test_cameras_tell_up_where_they_can(caplog):
 
 
 @pytest.mark.parametrize(("text", "found"), [
-    ("z", [0, 0, 1]), ("-y", [0, -1, 0]), ("+x", [1, 0, 0]), ("0,-2,0", [0, -1, 0]), ("-3,0,4", [-0.6, 0, 0.8]),
-    ("auto", "auto"), ("w", None), ("--y", None), ("1,2", None), ("0,0,0", None), ("nan,0,1", None), ("", None),
+    ("z", [0, 0, 1]), ("-y", [0, -1, 0]), ("+x", [1, 0, 0]), ("0,-2,0", [0, -1, 0]),
+    ("-3,0,4", [-0.6, 0, 0.8]),
+    ("auto", "auto"), ("w", None), ("--y", None), ("1,2", None), ("0,0,0", None), ("nan,0,1", None),
+    ("", None),
 ])  # fmt: skip
 def test_up_is_a_letter_three_numbers_or_auto(text, found):
     if found is None:
