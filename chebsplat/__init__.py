@@ -24,9 +24,7 @@ API = ("load", "run_stage", "train")
 
 
 def __getattr__(name: str) -> Any:
-    """`chebsplat.load`, `train` and `run_stage`, which are imported when first asked for: most
-    commands need none.
-    """
+    """`chebsplat.load`, `train` and `run_stage`, imported on first use: most commands need none."""
     if name in API:  # not an import statement: no stage depends on what the API imports
         return getattr(import_module("chebsplat.pipelines.api"), name)
     raise AttributeError(f"module 'chebsplat' has no attribute {name!r}")

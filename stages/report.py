@@ -1,6 +1,4 @@
-"""report: one self-contained HTML page with pictures, tables and error against run time, and the
-figures as CSV.
-"""
+"""report: one self-contained HTML page of pictures, tables and error against run time; CSV, too."""
 
 from __future__ import annotations
 
@@ -54,17 +52,17 @@ BYTES = {
     "ragged": "ragged arrays",
     "semantic": "semantic arrays, beside either",
 }
-# layouts of what plain 3DGS holds, without the bands that were pruned
+# layouts of plain 3DGS's values without the pruned bands
 SMALLER = ("split", "ragged")
 FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 
 
 def run(job: Job) -> None:
-    """One HTML page, and the figures as CSV, of what was measured and where it comes from.
+    """One HTML page, and the figures as CSV, of a scene's measurements and their origin.
 
-    Reads `evaluation` and `gaussians`, and of `model`, `capture`, `points`, `channels`, `features`,
-    `agreement`, `descriptors`, `encoding`, `lesson`, `knowledge`, `encoder`, `lifted`, `refined`
-    and `scene` what there is. Writes `report`.
+    Reads `evaluation` and `gaussians`, and, where there are, `model`, `capture`, `points`,
+    `channels`, `features`, `agreement`, `descriptors`, `encoding`, `lesson`, `knowledge`,
+    `encoder`, `lifted`, `refined` and `scene`. Writes `report`.
     """
     evaluation = Evaluation.read(job.inputs["evaluation"])
     gaussians = Gaussians.read(job.inputs["gaussians"])
@@ -74,11 +72,9 @@ def run(job: Job) -> None:
         )
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
     if "knowledge" in manifests and manifests["knowledge"].stage != STAGE_OF["knowledge"]:
-        del manifests["knowledge"]  # it ships, or was given: no stage of this scene has made it
-    facts, figures = (
-        {role: manifest.facts for role, manifest in manifests.items()},
-        evaluation.figures,
-    )
+        del manifests["knowledge"]  # it ships, or is the user's: no stage of this scene has made it
+    facts = {role: manifest.facts for role, manifest in manifests.items()}
+    figures = evaluation.figures
     left_out = absent_stages(job, gaussians) | figures["left_out"]
     for of_input in facts.values():
         left_out |= of_input.get("left_out", {})
@@ -131,7 +127,9 @@ def run(job: Job) -> None:
         left_out=sorted(left_out.items()),
         decided=decided_rows(facts["gaussians"]),
         started=started(job.inputs, facts),
-        posed=posed(PhotoModel.read(job.inputs["model"])) if "model" in job.inputs else None,
+        posed=describe_poses(PhotoModel.read(job.inputs["model"]))
+        if "model" in job.inputs
+        else None,
         versions=sorted(versions.items()),
         code=next((m.code for m in manifests.values() if "commit" in m.code), None),
         settings=json.dumps(settings, indent=1, sort_keys=True),
@@ -143,9 +141,7 @@ def run(job: Job) -> None:
 
 
 def psnr_of_one_color(evaluation: Evaluation) -> float:
-    """PSNR, dB, of some evaluated photos, if each pixel had their mean colour: what a scene shows
-    before training.
-    """
+    """PSNR, dB, of some evaluated photos against their mean colour: that of an untrained scene."""
     truth = evaluation.pictures["truth"]
     photos = np.stack([truth[k] for k in range(0, len(truth), -(-len(truth) // N_PICTURES))])
     flat = np.broadcast_to(photos.mean((0, 1, 2)).round().astype(np.uint8), photos.shape)
@@ -153,9 +149,7 @@ def psnr_of_one_color(evaluation: Evaluation) -> float:
 
 
 def clock_rows(training: Manifest) -> list[list[str]]:
-    """(figure, scene, teacher) of a training that the clock limits: how far it came depends on the
-    machine.
-    """
+    """(figure, scene, teacher) of a training by the clock, whose steps depend on the machine."""
     seconds = training.config.get("train", {}).get("seconds")
     if seconds is None:
         return []
@@ -166,10 +160,8 @@ def clock_rows(training: Manifest) -> list[list[str]]:
     return [[what, f"{training.facts['steps']:,}", ""]]
 
 
-def posed(model: PhotoModel) -> dict[str, Any]:
-    """Where photos that came alone were taken, in a sentence and a picture, and what is doubtful
-    about it.
-    """
+def describe_poses(model: PhotoModel) -> dict[str, Any]:
+    """Poses of photos that came alone, in a sentence and a picture, and doubts about them."""
     point, view = model.tracks.T
     counts = np.bincount(view, minlength=len(model.names))
     errors = np.bincount(view, model.errors[point], len(model.names)) / np.maximum(counts, 1)
@@ -179,17 +171,16 @@ def posed(model: PhotoModel) -> dict[str, Any]:
 
 
 def decided_rows(facts: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Settings that the training's config left open: name, value, and what decided it."""
-    words = {name: of["value"] for name, of in facts.get("decided", {}).items()}
-    shown = {
-        name: f"{value:.3g}" if isinstance(value, float) else str(value)
-        for name, value in words.items()
-    }
-    return [(f"train.{name}", value, facts["decided"][name]["by"]) for name, value in shown.items()]
+    """Settings that the training's config left open: name, value, and reason."""
+    return [
+        (f"train.{name}", f"{value:.3g}" if isinstance(value, float) else str(value), of["by"])
+        for name, of in facts.get("decided", {}).items()
+        for value in [of["value"]]
+    ]
 
 
 def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:
-    """(name, in a few words what it is) of the 2D teacher."""
+    """(name, kind in a few words) of the 2D teacher."""
     convention = facts["convention"]
     if facts["kind"] == "labels":
         return "noisy labels", (
@@ -228,13 +219,13 @@ def summary_rows(
     trained: dict[str, Any],
     timed: dict[str, str],
 ) -> list[list[str]]:
-    """Header, then (figure, scene, teacher). What was not measured says so.
+    """Header, then (figure, scene, teacher), "not measured" where there is no figure.
 
     Args: by_degree: Gaussians by SH degree, None where unknown; trained: facts of the training;
       timed: the machines that `evaluation` and training (`gaussians`) were measured on.
     """
 
-    def shown(value: float | None, form: str) -> str:
+    def write(value: float | None, form: str) -> str:
         return "not measured" if value is None else form.format(value)
 
     image = figures["image"]
@@ -242,15 +233,20 @@ def summary_rows(
     rows = [
         ["figure", "scene", "2D teacher"],
         [f"PSNR, dB (8-bit, mean over views{of})", f"{image['psnr']:.2f}", ""],
-        ["PSNR after a colour fit by view, dB", shown(image.get("psnr_fit"), "{:.2f}"), ""],
+        ["PSNR after a colour fit by view, dB", write(image.get("psnr_fit"), "{:.2f}"), ""],
         *taken_rows(image.get("as_taken")),
         ["SSIM (window 11, σ 1.5)", f"{image['ssim']:.4f}", ""],
-        ["LPIPS (vgg, images in [0, 1])", shown(figures["lpips"], "{:.3f}"), ""],
+        ["LPIPS (vgg, images in [0, 1])", write(figures["lpips"], "{:.3f}"), ""],
     ]
     segmentation = figures.get("segmentation") or {}
-    names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary "
-                                                                          "band",
-             "rarest_miou": "mIoU of the five rarest classes", "point_miou": "mIoU of 3D points"}  # fmt: skip
+    names = {
+        "miou": "mIoU",
+        "macc": "mAcc",
+        "oa": "OA",
+        "boundary_miou": "mIoU in the boundary band",
+        "rarest_miou": "mIoU of the five rarest classes",
+        "point_miou": "mIoU of 3D points",
+    }
     for key, name in names.items():
         if key in segmentation.get("scene", {}):
             teacher = segmentation.get("teacher")
@@ -259,8 +255,8 @@ def summary_rows(
             rows.append(
                 [
                     name + of_truth,
-                    shown(values[0], "{:.1%}"),
-                    shown(values[1], "{:.1%}") if teacher else "",
+                    write(values[0], "{:.1%}"),
+                    write(values[1], "{:.1%}") if teacher else "",
                 ]
             )
     rows.append(["Gaussians", f"{figures['n_gaussians']:,}", ""])
@@ -295,21 +291,19 @@ def summary_rows(
     return rows
 
 
-def taken_rows(taken: dict[str, Any] | None) -> list[list[str]]:
-    """Figures on the test photos as they were taken; none where these are what was trained on."""
-    if taken is None:
+def taken_rows(figures: dict[str, Any] | None) -> list[list[str]]:
+    """Rows of figures on the test photos as taken; none where these are the test views."""
+    if figures is None:
         return []
-    size = "{}×{}".format(*taken["size"])
+    size = "{}×{}".format(*figures["size"])
     return [
-        [f"PSNR on the photos as taken, {size} pixels, dB", f"{taken['psnr']:.2f}", ""],
-        ["SSIM on them", f"{taken['ssim']:.4f}", ""],
+        [f"PSNR on the photos as taken, {size} pixels, dB", f"{figures['psnr']:.2f}", ""],
+        ["SSIM on them", f"{figures['ssim']:.4f}", ""],
     ]
 
 
 def refined_rows(facts: dict[str, Any] | None) -> list[list[str]]:
-    """(figure, scene, teacher) of how the features were refined: what was chosen, and the
-    agreements it rests on.
-    """
+    """(figure, scene, teacher) of refined features: the choices, and the agreements behind them."""
     if facts is None:
         return []
     changed = {name: facts.get(f"changed_by_{name}") for name in ("smoothing", "knowledge")}
@@ -325,21 +319,20 @@ def refined_rows(facts: dict[str, Any] | None) -> list[list[str]]:
         ["knowledge in features", counts + words["knowledge"], ""],
     ]
     for name, curve in facts["curve"].items():
-        shown = " / ".join(f"{value:.4f}" for value in curve.values())
-        rows.append([f"agreement of half the training views with the other, smoothing {name}, at "
-                     "k = "
-                     + " / ".join(curve), shown, ""])  # fmt: skip
+        values = " / ".join(f"{value:.4f}" for value in curve.values())
+        figure = f"agreement of half the training views with the other, smoothing {name}, at k = "
+        rows.append([figure + " / ".join(curve), values, ""])
     return rows
 
 
 def agreement_rows(facts: dict[str, Any] | None) -> list[list[str]]:
-    """(figure, scene, teacher) of how far views agree on what points are by their 2D teacher."""
+    """(figure, scene, teacher) of the views' agreement on labels of points by their 2D teacher."""
     if facts is None:
         return []
     value, count = facts["agreement"], facts["n_points"]
-    shown = "not measured" if value is None else f"{value:.2f}"
+    text = "not measured" if value is None else f"{value:.2f}"
     return [
-        [f"agreement of views on labels of {count:,} points (1: always, 0: by chance)", "", shown]
+        [f"agreement of views on labels of {count:,} points (1: always, 0: by chance)", "", text]
     ]
 
 

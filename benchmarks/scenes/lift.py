@@ -48,10 +48,10 @@ def main(arguments: Sequence[str]) -> int:
                 pose,
                 K,
                 capture.size,
-                *to_cells(said, np.ones(said.shape[:2]), capture.size),
+                *to_cells(grid, np.ones(grid.shape[:2]), capture.size),
                 gate,
             )
-            for said, pose, K in zip(maps, cameras.cam_from_world, cameras.Ks, strict=True)
+            for grid, pose, K in zip(maps, cameras.cam_from_world, cameras.Ks, strict=True)
         )
         return gathered(len(gaussians[0]), maps[0].shape[-1], views)
 

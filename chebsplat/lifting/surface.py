@@ -1,5 +1,4 @@
-"""Points on the surface that views show, for scenes without measured depth: depth of many views,
-fused.
+"""Points on the surface that views show, for scenes without measured depth: fused depth of views.
 
 It is rendered from Gaussians, whose own centres lie off the surface that descriptors are of, or
 swept from photos.
@@ -36,9 +35,7 @@ LOOKOUT_SIZE, LOOKOUT_ANGLE = (192, 144), 1.4  # pixels; rad, across
 
 
 class Surface(NamedTuple):
-    """M points: means f64 [M, 3] scene units; eyes f64 [M, 3], the mean of the cameras that saw
-    them.
-    """
+    """M points: means f64 [M, 3] scene units; eyes f64 [M, 3], the mean of their cameras."""
 
     means: np.ndarray
     eyes: np.ndarray
@@ -55,15 +52,14 @@ def surface(
     """Points of the surface, at most one in a cube of edge EDGE.
 
     Args: parameters: raw, of N Gaussians; cam_from_world [V, 4, 4] and Ks [V, 3, 3] of views of
-      `size` (width, height);
-          unit: scene units of a metre; n_pixels: that are looked at, of all views alike, drawn.
+      `size` (width, height); unit: scene units of a metre; n_pixels: that are looked at, of all
+      views alike, drawn.
     Choices: depth as `render_depth` has it; points averaged by cube. How many pixels a cube needs
-      follows from how many
-      others hold: in a wide room, or of few pixels, all hold fewer.
+      follows from how many others hold: in a wide room, or of few pixels, all hold fewer.
     """
     renderer, (width, height) = SceneRenderer(dict(parameters)), size
     rng, count = np.random.default_rng(0), min(max(n_pixels // max(len(Ks), 1), 1), width * height)
-    seen, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    points, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for pose, K in zip(cam_from_world, Ks, strict=True):
         view = View(torch.from_numpy(K).float(), torch.from_numpy(pose).float(), width, height)
         depth, covered = (image.ravel() for image in renderer.render_depth(view, NEAREST * unit))
@@ -73,9 +69,9 @@ def surface(
             np.stack([pixels % width + 0.5, pixels // width + 0.5, np.ones(len(pixels))], 1)
             @ np.linalg.inv(K).T
         )
-        seen.append((rays * depth[pixels, None] - pose[:3, 3]) @ pose[:3, :3])
+        points.append((rays * depth[pixels, None] - pose[:3, 3]) @ pose[:3, :3])
         eyes.append(np.tile(-pose[:3, :3].T @ pose[:3, 3], (len(pixels), 1)))
-    return fused(np.concatenate(seen), np.concatenate(eyes), EDGE * unit)
+    return fused(np.concatenate(points), np.concatenate(eyes), EDGE * unit)
 
 
 def swept_surface(
@@ -85,20 +81,19 @@ def swept_surface(
 
     Args: Ks [V, 3, 3] in its pixels; cam_from_world [V, 4, 4]; unit: scene units of a metre.
     """
-    seen, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    points, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for depth, K, pose, eye in zip(
         depths, Ks, cam_from_world, centers(cam_from_world), strict=True
     ):
-        seen.append(unproject(depth, K, pose, np.argwhere(depth > 0)))
-        eyes.append(np.tile(eye, (len(seen[-1]), 1)))
-    return fused(np.concatenate(seen), np.concatenate(eyes), EDGE_SWEPT * unit, LEAST_SWEPT)
+        points.append(unproject(depth, K, pose, np.argwhere(depth > 0)))
+        eyes.append(np.tile(eye, (len(points[-1]), 1)))
+    return fused(np.concatenate(points), np.concatenate(eyes), EDGE_SWEPT * unit, LEAST_SWEPT)
 
 
 def lookouts(
     means: np.ndarray, opacities: np.ndarray, up: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Views [V, 4, 4] from within a room, and their K [V, 3, 3], for a splat without cameras; of
-    LOOKOUT_SIZE.
+    """Views [V, 4, 4] of LOOKOUT_SIZE within a room, and their K, for a splat without cameras.
 
     Args: means [N, 3] scene units, opacities [N] in (0, 1); up [3] unit.
     Choices: nine places about the middle of what is opaque, at half its height, looking six ways,
@@ -173,9 +168,7 @@ def lean(share: np.ndarray, height: np.ndarray, mask: np.ndarray) -> float:
 
 
 def fused(points: np.ndarray, eyes: np.ndarray, edge: float, least: float = LEAST) -> Surface:
-    """The mean of the points in each cube of this edge, and of their eyes, where it holds enough of
-    them (`least`).
-    """
+    """Mean of the points, and of their eyes, in each cube of this edge that has enough of them."""
     if len(points) == 0:
         return Surface(points, eyes)
     cube = np.unique(cubes_of(points, edge), return_inverse=True)[1]

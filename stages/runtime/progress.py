@@ -1,6 +1,4 @@
-"""Progress of long work: a bar with rate and ETA on a terminal, plain lines elsewhere, `log.jsonl`
-always.
-"""
+"""Progress of long work: a bar with rate and ETA on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -30,7 +28,7 @@ def log_level() -> str:
 
 
 class Progress:
-    """`show` forces or forbids the bar; by default it follows whether stderr is a terminal."""
+    """`show` forces or forbids the bar; by default there is one if stderr is a terminal."""
 
     def __init__(self, show: bool | None = None, every: float = 10.0):
         self.show = (sys.stderr is not None and sys.stderr.isatty()) if show is None else show
@@ -51,8 +49,8 @@ class Progress:
             self._log.write(json.dumps(values) + "\n")
 
     def ticker(self, total: int, what: str) -> Callable[[], None]:
-        """A function to call after each of `total` things that a library counts, not a loop of
-        ours; further calls than that show nothing.
+        """A function to call after each of `total` steps of a library's loop; further calls have no
+        effect.
         """
         steps = self.track(range(total), total, what)
         next(steps, None)
@@ -65,24 +63,23 @@ class Progress:
     def track(
         self, items: Iterable[T], total: int | Callable[[], int], what: str, start: int = 0
     ) -> Iterator[tuple[T, dict[str, Any]]]:
-        """Yield (item, status); what the caller puts into `status` is shown beside rate and ETA.
+        """Yield (item, status); the caller's entries in `status` are shown beside rate and ETA.
 
-        total: how many there will be, `start` of them done before; a function where that is only
-          found out on the way.
+        total: number of items, `start` of them done before; a function where it changes on the way.
         """
         status: dict[str, Any] = {}
         began = last = time.perf_counter()
         # the first item warms up and is not counted in the rate
-        for done, item in enumerate(items):
+        for index, item in enumerate(items):
             yield item, status
             now = time.perf_counter()
-            if done == 0:
+            if index == 0:
                 began = now
-            at = done + start + 1
+            at = index + start + 1
             n = total if isinstance(total, int) else total()
             if now - last >= (0.2 if self.show else self.every) or at == n:
                 last = now
-                rate = done / max(now - began, 1e-9)
+                rate = index / max(now - began, 1e-9)
                 eta = f"{(n - at) / rate:.0f} s" if rate > 0 else "unknown"
                 notes = "".join(f"  {k} {v}" for k, v in status.items())
                 line = f"{what} {at}/{n}{notes}  {rate:.1f}/s  ETA {eta}"

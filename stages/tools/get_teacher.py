@@ -311,7 +311,7 @@ def check(
       a view of a generated room; labels: as teacher.labels, None: the teacher's own.
     """
     from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-    from chebsplat.stages.teacher_models.trials import tried
+    from chebsplat.stages.teacher_models.trials import try_variants
 
     settings = TeacherSection()
     teacher = read_teacher(model)
@@ -329,8 +329,9 @@ def check(
     grid, n_channels = network.grid(image, settings.downscale)
     if teacher.output == "logits":
         label_names = label_set(teacher, labels, None) if labels else None
-        space = closed_set(teacher, label_names, n_channels, settings.n_channels)
         network.judge(images)
+        of_classes = network.class_shares(images, grid)
+        space = closed_set(teacher, label_names, of_classes, settings.n_channels)
     else:
         space = open_vocabulary(teacher, label_set(teacher, labels, None), n_channels, None)
     start = time.perf_counter()
@@ -363,7 +364,7 @@ def check(
             if teacher.output == "logits" and teacher.labels
             else space.names
         )
-        findings += tried(network, images, classes, space.embeddings)
+        findings += try_variants(network, images, classes, space.embeddings)
     return [
         ("name", f"{teacher.name} ({model}, {model.stat().st_size / 2**20:.1f} MB)"),
         (

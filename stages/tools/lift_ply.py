@@ -39,8 +39,8 @@ from chebsplat.stages import export, lift
 from chebsplat.stages.learn import KNOWN
 from chebsplat.stages.runtime.command import publish
 from chebsplat.stages.shape_models.answers import encoded, units
-from chebsplat.stages.shape_models.surfaces import shown
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.shape_models.surfaces import from_splat
+from chebsplat.stages.teacher_models.text_encoder import match_names
 from chebsplat.stages.tools.page import foreign
 from chebsplat.stages.tools.up import Up, up_of
 from chebsplat.stages.training.placing import in_frame
@@ -180,7 +180,7 @@ def label_ply(
         if path.exists():
             raise ConfigError(f"{path} exists; remove it, or choose another --out")
     prior = read_knowledge(knowledge)
-    rows = found(words, prior.words)
+    rows = match_names(words, prior.words)
     if -1 in rows:
         word = words[rows.index(-1)]
         near = ", ".join(suggest(word, prior.words))
@@ -193,7 +193,7 @@ def label_ply(
     poses, Ks = lookouts(
         parameters["means"].astype(np.float64), expit(parameters["logit_opacities"]), up
     )
-    cloud = shown(parameters, poses, Ks, LOOKOUT_SIZE, unit)
+    cloud = from_splat(parameters, poses, Ks, LOOKOUT_SIZE, unit)
     log.info("%d points of a surface, %.3g units a metre", len(cloud.means), unit)
     shape = encoded(
         prior, point_inputs(*cloud, up=up, unit=unit, describe=DescribeSection(**prior.describe))

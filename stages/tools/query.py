@@ -17,7 +17,7 @@ from chebsplat.formats.onnx_files import model_sha256
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
 from chebsplat.labels.calibration import CUT, Calibration, presence, probability, relevancy
 from chebsplat.labels.names import folded
-from chebsplat.stages.teacher_models.text_encoder import found, text_embeddings
+from chebsplat.stages.teacher_models.text_encoder import match_names, text_embeddings
 
 log = logging.getLogger("chebsplat")
 
@@ -170,7 +170,7 @@ def are_words(texts: list[str], teacher: TeacherModel) -> list[bool]:
     """True for each text that a calibration covers: words of the teacher's table, if any."""
     if teacher.labels is None:
         return [True] * len(texts)
-    return [row >= 0 for row in found(texts, read_label_table(teacher.labels)[0], False)]
+    return [row >= 0 for row in match_names(texts, read_label_table(teacher.labels)[0], False)]
 
 
 def embed_words(words: list[str], features: Features, model: str | None) -> np.ndarray:
@@ -186,7 +186,7 @@ def embed_words(words: list[str], features: Features, model: str | None) -> np.n
 def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
     """A query of a scene whose teacher scores its own labels only."""
     names = features.label_names
-    rows = found([text, *phrases], names, last_word=False)
+    rows = match_names([text, *phrases], names, last_word=False)
     target, others = rows[0], rows[1:]
     for word, row in zip((text, *phrases), rows, strict=True):
         if row < 0:

@@ -175,10 +175,10 @@ def test_points_are_held_against_the_depth_of_training_views_and_without_it_cell
         "cam_from_world": wall.cam_from_world,
         "means": means,
     }
-    assert sfm.missed(wall, cloud) == {"depth_error": pytest.approx(0.01)}
+    assert sfm.check_points(wall, cloud) == {"depth_error": pytest.approx(0.01)}
     wall.depth = None
-    assert sfm.missed(wall, cloud)["covered"] > 0.5
-    assert sfm.missed(wall, cloud | {"means": means[:1]})["covered"] == pytest.approx(1 / 320)
+    assert sfm.check_points(wall, cloud)["covered"] > 0.5
+    assert sfm.check_points(wall, cloud | {"means": means[:1]})["covered"] == pytest.approx(1 / 320)
 
 
 @pytest.mark.xdist_group("toy")

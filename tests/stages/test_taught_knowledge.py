@@ -22,7 +22,7 @@ from chebsplat.pipelines.planning.sequences import plan_teaching
 from chebsplat.shape.point_inputs import point_inputs
 from chebsplat.splats.gaussians import local_shape
 from chebsplat.stages.onnx import ENCODER, first
-from chebsplat.stages.recall import taught
+from chebsplat.stages.recall import combine_lessons
 from chebsplat.stages.registry import OF_KNOWLEDGE
 from chebsplat.stages.settings import TeachSection
 from chebsplat.stages.shape_models import surfaces, teaching_rooms
@@ -126,7 +126,7 @@ def test_what_ships_is_whole_small_and_says_what_it_was_taught():
     assert knowledge.card["held_out"]["shape"] > 0.8
     assert set(CLASS_NAMES) <= set(knowledge.words)
     # no lesson adds nothing
-    np.testing.assert_allclose(taught(knowledge, {}).map, knowledge.map, atol=1e-4)
+    np.testing.assert_allclose(combine_lessons(knowledge, {}).map, knowledge.map, atol=1e-4)
 
 
 @pytest.mark.xdist_group("toy")
@@ -236,7 +236,7 @@ def test_without_measured_depth_knowledge_is_asked_of_swept_depth_or_left_out(
         ("too little", "on", 0.9),
         ("none", "off", 0.1),
     ):
-        monkeypatch.setattr(surfaces, "LEAST_TOLD", least)  # the toy's photos tell a fifth
+        monkeypatch.setattr(surfaces, "LEAST_SWEPT", least)  # the toy's photos tell a fifth
         config, made = (
             withheld | {"sfm": {"max_points": 300, "dense": dense}},
             toy | {"ingest": tmp_path / "ingest"},

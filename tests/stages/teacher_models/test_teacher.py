@@ -215,6 +215,28 @@ def test_classes_of_a_segmenter_that_mean_one_label_become_it(tmp_path, capture)
     assert encoded(tmp_path / "other", capture, tmp_path / "tiny.onnx", labels=str(file))[0] == 3
 
 
+@pytest.mark.parametrize(
+    ("classes", "labels", "names"),
+    [
+        ("red\ngreen\nsea", "", ["red", "green"]),  # a fifth of the pixels
+        ("Sky\nroad\nsea", "", ["Sky", "road", "sea"]),  # all are of outdoors: this is no room
+        ("red\ngreen\nsea", "sea: sea\n", ["red", "green", "sea"]),  # asked for
+        ("red\nblue\nsea", "blue: blue, sea\n", ["red", "blue"]),
+    ],
+)
+def test_classes_of_outdoors_are_left_out_of_a_room(tmp_path, classes, labels, names):
+    image, _ = painted(np.random.default_rng(0))
+    image[image[..., 2] > 128] = (255, 0, 0)
+    image[:6] = (0, 0, 255)
+    capture = published_capture(tmp_path / "room", image[None], class_names=())
+    (tmp_path / "labels.txt").write_text(labels)
+    asked = {"labels": str(tmp_path / "labels.txt")} if labels else {}
+    code, found = encoded(tmp_path, capture, segmenter(tmp_path, f"{classes}\n"), **asked)
+    assert (code, found.label_names) == (0, names)
+    assert found.confidence[:].min() > 0.4
+    assert (found.pseudo_labels[:] >= 0).all()
+
+
 def test_of_a_segmenter_whose_toml_says_no_output_the_labels_tell(tmp_path):
     """Names alone are of channels; a table of embeddings, or an encoder of words, is of
     features.

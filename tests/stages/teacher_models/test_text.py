@@ -74,8 +74,8 @@ def test_a_plural_takes_its_singular_and_says_so(teacher, name, row, caplog):
 )  # fmt: skip
 def test_a_label_is_found_by_the_words_it_is_made_of_and_then_by_the_last(name, form):
     known = ["stand", "tv stand", "air conditioner", "conditioner", "by", "chair"]
-    assert text_encoder.found([name], known) == [known.index(form) if form else -1]
-    assert text_encoder.found([name], [*known, name])[0] == (
+    assert text_encoder.match_names([name], known) == [known.index(form) if form else -1]
+    assert text_encoder.match_names([name], [*known, name])[0] == (
         known.index(name) if name in known else len(known)
     )
 
@@ -84,7 +84,7 @@ def test_the_last_word_stands_for_a_phrase_only_where_no_encoder_knows_better(te
     with caplog.at_level(logging.INFO, "chebsplat"):
         assert text_embeddings(["office chair", "Chair_7"], teacher).argmax(1).tolist() == [0, 0]
     assert "office chair is not in" in caplog.text and "Chair_7 is not in" in caplog.text
-    assert text_encoder.found(["office chair", "Chair_7"], NAMES, last_word=False) == [-1, 0]
+    assert text_encoder.match_names(["office chair", "Chair_7"], NAMES, last_word=False) == [-1, 0]
 
 
 def test_rows_come_in_the_order_asked_for(teacher):
