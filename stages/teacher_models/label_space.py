@@ -36,7 +36,7 @@ OUTDOORS = (
     "sidewalk", "sky", "skyscraper", "streetlight", "tent", "terrain", "tower", "traffic light",
     "traffic sign", "train", "tree", "truck", "van", "vegetation", "water", "waterfall",
 )  # fmt: skip
-# views are of a room up to this share of OUTDOORS: nine captures indoors have .01 to .12, outdoors .97
+# up to this share of OUTDOORS views are of a room: nine captures of rooms have .01 to .12
 IN_A_ROOM = 0.3
 LEAST = 12  # of these words in a teacher's table; with fewer all words of the table are labels
 
