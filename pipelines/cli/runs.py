@@ -79,15 +79,20 @@ def run(stage: str | None, cores: int | None, device: str, on: str, **choice: An
 @with_scene
 @ON_DEVICE
 def plan(device: str, **choice: Any) -> None:
-    """Show what would run, what is fresh, and what the scene leaves out, and why."""
+    """Show how long it would take, what would run, what is fresh and what is left out, and why."""
+    from chebsplat.pipelines.planning.forecast import forecast, sentence
     from chebsplat.pipelines.running.run import device_of
     from chebsplat.pipelines.selection import plans
 
-    chosen = plans(**choice, device=device_of(device))
-    for one in chosen:
+    used, cores = device_of(device), os.cpu_count() or 1
+    for one in plans(**choice, device=used):
+        found = forecast(one, [step for step in one.steps if not step.fresh], cores, used)
+        print(f"{one.title}: {sentence(one, found, cores, used)}")
         print(f"{one.title}: {one.source}")
         for step in one.steps:
-            print(f"  {'fresh' if step.fresh else 'would run':9s} {step.stage:9s} {step.key}")
+            what = "fresh" if step.fresh else "would run"
+            took = f"{found.seconds[step.stage]:6.0f} s" if found and not step.fresh else ""
+            print(f"  {what:9s} {step.stage:9s} {step.key}{took}")
         for what, why in one.left_out.items():
             print(f"  left out  {what}: {why}")
 

@@ -32,9 +32,9 @@ LIFTED = "train.features is lifted"
 PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes", "video")
 POSELESS = ("photos", "video")  # kinds that bring no poses
 UNASKED = "no teacher is named"
+FETCH = "chebsplat get-teacher segformer-b0-ade"
 HOW = (
-    "the embedded one has seen generated rooms only. `chebsplat get-teacher segformer-b0-ade` "
-    "fetches one for photos "
+    f"the embedded one has seen generated rooms only. `{FETCH}` fetches one for photos "
     "(docs/teachers.md), set=teacher.model=MODEL.onnx names it; teacher.kind=embedded uses the "
     "embedded one even so"
 )

@@ -10,11 +10,10 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.points import Points
-from chebsplat.settings import MOST_STEPS, PRINTED, TrainSection
+from chebsplat.settings import FEWEST_STEPS, PRINTED, TrainSection, default_steps
 from chebsplat.stages.training.views import disagreement, training_rows
 
 OPEN = (None, "auto")  # values of a setting that leave it open
-FEWEST = 1000  # steps that a training has by default, at least; below it rates rise no further
 PUBLISHED = 30_000  # steps that 3DGS's rates are for
 TRAVEL, FASTEST = 10.0, 5e-2  # a features' rate: less than TRAVEL over all steps does not arrive
 DEPTH_WEIGHT = 0.8
@@ -53,14 +52,6 @@ class Default:
     by: str
 
 
-def _steps(_: TrainSection, evidence: Evidence) -> int:
-    """By held-out training views (docs/results/training.md, "How many steps"): the more there is to
-    see, the longer a training gains. 70 photos of 320×240 pixels are best served by 1500 steps, and
-    with 3000 lose 0.5 dB again; 43 of 360×640 gain until 3000.
-    """
-    return min(max(100 * round(2.8 * evidence.n_pixels / 1e6), FEWEST), MOST_STEPS)
-
-
 def _feature_every(_: TrainSection, evidence: Evidence) -> int:
     """One step in four teaches features as well as every one, for less than half of what they add
     to a step's time. Where views are few, features hold the Gaussians in place, too (ten views:
@@ -87,10 +78,10 @@ def _by_steps(published: float, power: float) -> Default:
 
     def rate(train: TrainSection, _: Evidence) -> float:
         assert train.steps is not None
-        return published * max(PUBLISHED / max(train.steps, FEWEST), 1) ** power
+        return published * max(PUBLISHED / max(train.steps, FEWEST_STEPS), 1) ** power
 
     return Default(
-        rate, f"steps, taken as {FEWEST} to 30,000: {published:g} (30,000 / steps)^{power:g}"
+        rate, f"steps, taken as {FEWEST_STEPS} to 30,000: {published:g} (30,000 / steps)^{power:g}"
     )
 
 
@@ -105,7 +96,10 @@ def _exposure(_: TrainSection, evidence: Evidence) -> str:
 
 
 DEFAULTS = {  # in this order: a later one may ask for an earlier
-    "steps": Default(_steps, "pixels of the training photos: 280 a megapixel, from 1000 to 3000"),
+    "steps": Default(
+        lambda _, evidence: default_steps(evidence.n_pixels),
+        "pixels of the training photos: 280 a megapixel, from 1000 to 3000",
+    ),
     "feature_every": Default(
         _feature_every, "training views: a tenth of their number, from 1 to 4"
     ),
