@@ -13,6 +13,7 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.extras import extra
 from chebsplat.formats.files import atomic_path
 
 BLOCK = 16  # voxels along a block of the grid
@@ -89,15 +90,7 @@ def meshlab() -> Any:
     """The module that cleans meshes. Raises ConfigError where it, or a library that it is linked
     to, is missing.
     """
-    try:
-        import pymeshlab
-    except ImportError as error:  # of the package, or of a library that it is linked to
-        raise ConfigError(
-            f"cleaning a mesh needs pymeshlab ({error}); install the extra: pip install "
-            "'chebsplat[mesh]', and where a "
-            "library of the system is named, that one; or ask for the mesh as it is: --raw"
-        ) from None
-    return pymeshlab
+    return extra("pymeshlab", "cleaning a mesh", "ask for the mesh as it is: --raw")
 
 
 def cleaned(

@@ -59,6 +59,11 @@ class Known:
     model: bool
 
     @property
+    def rich(self) -> float:
+        """How full of features a photo is: small ones have fewer."""
+        return min(self.posed / self.photos / LARGEST, 1)
+
+    @property
     def step(self) -> float:
         """Seconds of a training step."""
         colour = 0.010 + 0.075 * min(self.seen / self.photos, LARGEST)
@@ -69,7 +74,9 @@ class Known:
 # s of a stage on two idle cores of an AMD EPYC: fitted to generated rooms, fox, redkitchen,
 # house_kitchen and seven captures of photos at 640 to 1600 pixels, within a factor of 1.5 for most
 SECONDS: dict[str, Callable[[Known], float]] = {
-    "pose": lambda k: 2 + 0.3 * k.photos + 0.06 * k.taken + 0.6 * k.posed + 0.04 * k.pairs,
+    "pose": lambda k: (
+        2 + 0.06 * k.taken + 0.6 * k.posed + (0.3 * k.photos + 0.04 * k.pairs) * k.rich
+    ),
     "ingest": lambda k: (
         0.5 + 2.4 * k.seen if k.kind == "generated" else 0.5 + 0.03 * k.taken + 0.4 * k.seen
     ),

