@@ -154,7 +154,8 @@ def test_a_hundred_frames_outlive_a_kill_and_equal_evaluates_renders(scene, fold
     file = hundred(scene, tmp_path / "cameras.json")
     there = killed_and_resumed(folder, tmp_path / "frames", file, size, 7)
     assert 7 <= len(there) < 100
-    renderer, (width, height) = SceneRenderer(scene.parameters), map(int, size.split("x"))
+    renderer = SceneRenderer(scene.parameters, Ks=scene.exported.cameras.Ks)
+    width, height = map(int, size.split("x"))
     for k, row in enumerate(json.loads(file.read_text())):
         rotation = np.array(row["rotation"]).T
         pose = np.eye(4)
