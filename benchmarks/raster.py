@@ -201,7 +201,7 @@ def main(arguments: Sequence[str]) -> int:
         variants["cuda"] = (4, step("cuda"))
     times = take_turns(variants, options.rounds)
     base, colors = times["cpu, 4 threads"], times["training step, 3 colors"]
-    bars: list[tuple[str, float, str, float]] = [
+    bars: list[shared.Bar] = [
         ("torch over cpu, four threads", times["torch, 4 threads"] / base, ">=", 20),
         ("19 channels over 3", base / times["cpu, 3 channels"], "<=", 2.0),
         ("100k Gaussians over 20k", times["cpu, 100k"] / base, "<=", 1.9),
@@ -225,12 +225,9 @@ def main(arguments: Sequence[str]) -> int:
     for name, ms in times.items():
         print(f"  {name:<36} {ms:9.2f} ms")
         rows.append({"what": name, "value": ms, "unit": "ms"})
-    missed = 0
-    for what, value, relation, bar in bars:
-        within = value >= bar if relation == ">=" else value <= bar
-        missed += not within
-        print(f"  {what:<36} {value:9.3g}   {relation} {bar:<7g} {'' if within else 'MISSED'}")
+    met = shared.judged(bars)
+    for (what, value, relation, bar), within in zip(bars, met, strict=True):
         bounds = {"bar": f"{relation} {bar:g}", "within": within}
         rows.append({"what": what, "value": value, "unit": "ratio", **bounds})
     shared.write_csv(options.out / "rasterize.csv", rows)
-    return int(missed > 0)
+    return int(not all(met))

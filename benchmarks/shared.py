@@ -20,6 +20,8 @@ from chebsplat.pipelines.running.run import execute
 from chebsplat.pipelines.work.scenes import data_of
 from chebsplat.stages.runtime.machine import cores, load, processor
 
+Bar = tuple[str, float, str, float]  # what, value, ">=" or "<=", bar
+
 
 def parser(name: str, description: str | None, work: bool = False) -> ArgumentParser:
     """The arguments of benchmark `name`: --out, --work for one on a scene; it adds its own."""
@@ -44,6 +46,14 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         writer = csv.DictWriter(handle, list(dict.fromkeys(key for row in rows for key in row)))
         writer.writeheader()
         writer.writerows(rows)
+
+
+def judged(bars: Sequence[Bar]) -> list[bool]:
+    """Print values beside their bars, and return which are met; nan, not measured, meets none."""
+    met = [value >= bar if relation == ">=" else value <= bar for _, value, relation, bar in bars]
+    for (what, value, relation, bar), within in zip(bars, met, strict=True):
+        print(f"  {what:<36} {value:9.3g}   {relation} {bar:<7g} {'' if within else 'MISSED'}")
+    return [bool(within) for within in met]
 
 
 def there(scenes: Sequence[str]) -> list[str]:

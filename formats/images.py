@@ -13,13 +13,13 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.formats.extras import extra
 from chebsplat.formats.files import regular
 
 FORMATS = ("PNG", "JPEG")
@@ -61,13 +61,7 @@ def is_heic(path: Path) -> bool:
 
 def require_heic(path: Path) -> None:
     """Raises InputError with the command that installs the reader of HEIC, if it is missing."""
-    try:
-        import_module("pillow_heif")
-    except ImportError:
-        raise InputError(
-            f"{path} is a HEIC photo, which the package pillow_heif reads: .venv/bin/pip install "
-            "-e '.[heic]' installs it"
-        ) from None
+    extra("pillow_heif", f"{path} is a HEIC photo, which", error=InputError)
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.extras import extra
 from chebsplat.formats.files import atomic_path
 
 BLOCK = 16  # voxels along a block of the grid
@@ -81,16 +82,10 @@ def fuse_depth(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: flo
 
 
 def meshlab() -> Any:
-    """The module pymeshlab. Raises ConfigError where it, or a library that it needs, is missing."""
-    try:
-        import pymeshlab
-    except ImportError as error:  # of the package, or of a library that it is linked to
-        raise ConfigError(
-            f"cleaning a mesh needs pymeshlab ({error}); install the extra: pip install "
-            "'chebsplat[mesh]', and where a "
-            "library of the system is named, that one; or ask for the mesh as it is: --raw"
-        ) from None
-    return pymeshlab
+    """The module that cleans meshes. Raises ConfigError where it, or a library that it is linked
+    to, is missing.
+    """
+    return extra("pymeshlab", "cleaning a mesh", "ask for the mesh as it is: --raw")
 
 
 def clean_mesh(

@@ -6,13 +6,13 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.formats.extras import extra
 from chebsplat.formats.files import regular
 from chebsplat.formats.images import MAX_PIXELS, MAX_SIDE
 
@@ -68,13 +68,7 @@ def quarters(frame: Any) -> int:
 
 def require_av(path: Path) -> Any:
     """The package av. Raises InputError with the command that installs it, if it is missing."""
-    try:
-        return import_module("av")
-    except ImportError:
-        raise InputError(
-            f"{path} is a video, which the package av reads: .venv/bin/pip install -e '.[video]' "
-            "installs it"
-        ) from None
+    return extra("av", f"{path} is a video, which", error=InputError)
 
 
 def describe(path: Path) -> Video:

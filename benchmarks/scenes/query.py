@@ -122,5 +122,6 @@ def main(arguments: Sequence[str]) -> int:
             for key, value in line.items()
         )
         print("  ".join(cells))
-    print(f"{len(folders)} rooms, {len(absent)} absent words, {shared.processor()}; bars: {BARS}")
-    return int(any(total[0][name] < bar for name, bar in BARS.items()))
+    print(f"{len(folders)} rooms, {len(absent)} absent words, {shared.processor()}")
+    bars: list[shared.Bar] = [(name, total[0][name], ">=", bar) for name, bar in BARS.items()]
+    return int(not all(shared.judged(bars)))

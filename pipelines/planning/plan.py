@@ -66,6 +66,7 @@ class Step:
     raw: Hashes = field(default_factory=dict)  # of the raw files that it reads
     # artifacts that are made first, although it does not read them
     after: list[Path] = field(default_factory=list)
+    expected: float | None = None  # s that it is expected to take, where that was forecast
 
     @property
     def fresh(self) -> bool:

@@ -20,6 +20,7 @@ from typing import Any
 import yaml
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.extras import require
 from chebsplat.pipelines.work import leases, store
 from chebsplat.pipelines.work.store import say
 from chebsplat.settings import MOST_STEPS
@@ -28,7 +29,7 @@ from chebsplat.stages.runtime.stopping import end_itself
 
 HERE = Path(__file__).parents[1]
 LOCAL, SLURM = "local", "slurm"
-EXTRA = ".venv/bin/python -m uv pip install --python .venv/bin/python --editable '.[slurm]'"
+PLUGIN = "snakemake_executor_plugin_slurm"
 
 
 @dataclass(frozen=True)
@@ -96,9 +97,13 @@ def checked(on: str) -> str:
     if on == LOCAL:
         return on
     executor = executor_of(on)
-    if find_spec(f"snakemake_executor_plugin_{executor.replace('-', '_')}") is None:
-        advice = EXTRA if executor == SLURM else f"install snakemake-executor-plugin-{executor}"
-        raise ConfigError(f"on={on}: Snakemake's plugin for {executor} is not installed; {advice}")
+    if executor == SLURM:
+        require(PLUGIN, f"on={on}")
+    elif find_spec(f"snakemake_executor_plugin_{executor.replace('-', '_')}") is None:
+        raise ConfigError(
+            f"on={on}: Snakemake's plugin for {executor} is not installed; "
+            f"install snakemake-executor-plugin-{executor}"
+        )
     if executor == SLURM and shutil.which("sbatch") is None:
         raise ConfigError(
             f"on={on}: there is no sbatch on the PATH; run this where jobs are submitted from"

@@ -76,7 +76,7 @@ def make(plan: Path, key: str) -> None:
         store.remove_half(out)
         config, hashes = Path(f"{files}.json"), json.loads(Path(f"{files}.raw.json").read_text())
         module = import_module(f"chebsplat.stages.{stage}")
-        planned = Planned(key, step["code"], prepare_stage(step, hashes))
+        planned = Planned(key, step["code"], prepare_stage(step, hashes), step["expected"])
         publish(stage, module.run, out, inputs, config, planned=planned, device=step["device"])
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.formats.files import atomic_write, explained
+from chebsplat.pipelines.planning.forecast import forecast, sentence
 from chebsplat.pipelines.planning.plan import Plan, Step
 from chebsplat.pipelines.running import cluster, job, processes
 from chebsplat.pipelines.work import heads, leases, store, summary
@@ -56,6 +57,11 @@ def execute(
     steps = {step.key: step for plan in plans for step in needed_steps(plan, stage, plans)}
     stale = [step for step in steps.values() if not step.fresh]
     for plan in plans:
+        awaited = [step for step in plan.steps if step.key in steps and not step.fresh]
+        found = forecast(plan, awaited, cores, device)
+        for step in awaited:
+            step.expected = found.seconds[step.stage] if found else None
+        say(f"{plan.title}: {sentence(plan, found, cores, device)}")
         say(f"{plan.title}: {plan.source}")
         if is_verbose():
             for what, why in plan.left_out.items():
@@ -259,6 +265,7 @@ def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, A
         "code": step.code | state,
         "raw": step.raw,
         "device": STAGES[step.stage].device(device, step.sections),
+        "expected": step.expected,
     }
 
 

@@ -100,13 +100,14 @@ def command(name: str, run: Callable[[Job], None]) -> click.Command:
 @dataclass
 class Planned:
     """The planner's part of a step: its key (None: of settings and inputs alone), the identity of
-    its code, and a context to run within, which can raise on exit to keep the artifact from being
-    published.
+    its code, a context to run within, which can raise on exit to keep the artifact from being
+    published, and the seconds that it is expected to take.
     """
 
     key: str | None = None
     code: dict[str, Any] = field(default_factory=dict)
     within: AbstractContextManager[Any] = field(default_factory=nullcontext)
+    expected: float | None = None
 
 
 def publish(
@@ -134,7 +135,7 @@ def publish(
     if not force and artifact.is_whole(out, stage.schema):
         log.info("already there")
         return
-    inputs, progress = {role: path.absolute() for role, path in inputs.items()}, Progress()
+    inputs = {role: path.absolute() for role, path in inputs.items()}
     job_config = configs.load(config) if config else configs.Config()
     schemas = stage.schemas(inputs)
     manifests = {role: artifact.read_manifest(path, schemas[role]) for role, path in inputs.items()}
@@ -144,6 +145,7 @@ def publish(
     device = stage.device(device, settings)
     computed = {} if device == "cpu" else {"device": device}
     planned = planned or Planned()
+    shown = Progress(expected=planned.expected)
     key = planned.key or artifact.digest(
         {"stage": name, "config": settings, "inputs": sources} | computed
     )
@@ -165,9 +167,9 @@ def publish(
         code=planned.code,
     )
     scratch, watch = out.parent / f".part-{out.name}", Stopwatch(n_threads(), name_of(device))
-    with artifact.publish(out, manifest, force) as tmp, planned.within:
-        job = Job(inputs, job_config, tmp, scratch, device, progress, manifest.facts, watch)
-        with progress.log_to(tmp / "log.jsonl"):
+    with artifact.publish(out, manifest, force) as tmp, shown.alive(), planned.within:
+        job = Job(inputs, job_config, tmp, scratch, device, shown, manifest.facts, watch)
+        with shown.log_to(tmp / "log.jsonl"):
             run(job)
         manifest.processes = watch.processes()
         manifest.seconds = round(sum(of["seconds"] for of in manifest.processes), 3)

@@ -138,6 +138,13 @@ def file_of(view: int) -> str:
     return f"{view:06d}.png"
 
 
+def is_photo(path: Path, root: Path) -> bool:
+    """Whether an image below a source's folder is a photo by its path, not a mask, depth or label
+    map.
+    """
+    return BESIDE.isdisjoint(re.findall("[a-z]+", str(path.relative_to(root)).lower()))
+
+
 def stem(name: str) -> str:
     """A relative POSIX path without the suffix of an image; other dots are part of the name."""
     base, end = os.path.splitext(name)

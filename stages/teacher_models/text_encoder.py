@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.formats.extras import extra, require
 from chebsplat.formats.names import suggest
 from chebsplat.formats.teacher_model import read_label_table
 from chebsplat.labels.names import folded, rows_of
@@ -96,12 +97,8 @@ def _encoded(names: list[str], teacher: TeacherModel, vocabulary: list[str]) -> 
     texts = [teacher.prompt.replace("{}", name) for name in names]
     if isinstance(teacher.text, Path):
         return _by_model(texts, teacher, lacking)
-    try:
-        return sentence_embeddings(texts)
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{lacking}; for free text install the extra: pip install -e '.[text]' ({error})"
-        ) from None
+    require(PACKAGE, f"{lacking}; free text", error=InputError)
+    return sentence_embeddings(texts)
 
 
 def sentence_embeddings(texts: list[str]) -> np.ndarray:
@@ -121,14 +118,9 @@ def _by_model(texts: list[str], teacher: TeacherModel, lacking: str) -> np.ndarr
     Choices: inputs are identified by name, as in ENTRIES; a single input of another name takes the
       ids. One text at a time, so that padding never counts.
     """
+    tokenizers = extra("tokenizers", f"{lacking}; {teacher.text}", error=InputError)
     try:
-        from tokenizers import Tokenizer
-    except ModuleNotFoundError:
-        raise InputError(
-            f"{lacking}; {teacher.text} needs the package tokenizers, pip install tokenizers"
-        ) from None
-    try:
-        tokenizer = Tokenizer.from_file(str(teacher.tokenizer))
+        tokenizer = tokenizers.Tokenizer.from_file(str(teacher.tokenizer))
     except Exception as error:  # tokenizers raises nothing narrower
         raise InputError(
             f"{teacher.tokenizer} is not a tokenizer.json ({error}); write it again"

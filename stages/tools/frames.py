@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.extras import extra
 from chebsplat.formats.files import atomic_path, atomic_write, parse_json
 from chebsplat.formats.images import opened, read_rgb
 from chebsplat.labels.decode import decode_labels
@@ -33,7 +34,6 @@ KINDS = ("color", "labels", "depth", "relevancy")
 SEMANTIC = ("labels", "relevancy")
 REQUEST = "frames.json"
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk
-INSTALL = ".venv/bin/pip install -e '.[video]'"
 CRF = "18"  # x264's constant rate factor, visually almost lossless
 
 
@@ -204,13 +204,7 @@ def depth_colors(depth: np.ndarray, far: float) -> np.ndarray:
 
 def library() -> Any:
     """PyAV. Raises ConfigError with the command that installs it."""
-    try:
-        import av
-    except ImportError:
-        raise ConfigError(
-            f"videos need the extra `video`: {INSTALL}; or render into a folder"
-        ) from None
-    return av
+    return extra("av", "writing a video", "render into a folder")
 
 
 def render_video(
@@ -225,7 +219,6 @@ def render_video(
 
     Raises: ConfigError where `out` exists, on two kinds, and on sizes that no video has.
     """
-    library()
     if out.exists():
         raise ConfigError(f"{out} exists; remove it, or choose another --out")
     if len(shot.kinds) != 1:

@@ -19,6 +19,7 @@ import numpy as np
 
 from chebsplat.errors import ChebsplatError, ConfigError, InputError
 from chebsplat.formats.artifact import sha256_file
+from chebsplat.formats.extras import require
 from chebsplat.formats.files import parse_json
 from chebsplat.formats.images import images_below, read_rgb
 from chebsplat.formats.onnx_files import model_sha256, weight_files
@@ -106,14 +107,9 @@ def parsed(name: str) -> tuple[str, str, str]:
 
 def fetch_file(repository: str, file: str, revision: str) -> Path:
     """A file of a repository in the hub's cache, downloaded if need be, its checksum verified."""
-    try:
-        import httpx2
-        from huggingface_hub import constants, errors, hf_hub_download
-    except ImportError:
-        raise ConfigError(
-            "get-teacher needs the package huggingface_hub: .venv/bin/pip install -e '.[hub]' "
-            "installs it"
-        ) from None
+    require("huggingface_hub", "get-teacher")
+    import httpx2
+    from huggingface_hub import constants, errors, hf_hub_download
 
     where = f"{repository}: {file}"
     try:

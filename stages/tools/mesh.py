@@ -10,7 +10,7 @@ import numpy as np
 from chebsplat.cameras import unproject, upright
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.evaluation.metrics import features_at
-from chebsplat.formats.meshes import Frame, Mesh, clean_mesh, fuse_depth, meshlab
+from chebsplat.formats.meshes import Frame, Mesh, clean_mesh, fuse_depth
 from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.tools.scene import OpenedScene
@@ -42,8 +42,6 @@ def mesh_of(
         raise ConfigError(
             f"{scene.source} has no cameras to see its surface from; open a scene that was trained"
         )
-    if not raw:
-        meshlab()  # fails on a missing extra before minutes are spent
     extent = room_extent(scene)
     edge = extent / N_VOXELS if voxel is None else voxel / scene.world.scale
     size = f"{edge * scene.world.scale:.3g}"

@@ -10,11 +10,10 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.points import Points
-from chebsplat.settings import MOST_STEPS, PRINTED, TrainSection
+from chebsplat.settings import FEWEST_STEPS, PRINTED, TrainSection, default_steps
 from chebsplat.stages.training.views import disagreement, training_rows
 
 OPEN = (None, "auto")  # values of a setting that leave it open
-FEWEST = 1000  # steps that a training has by default, at least; below it rates rise no further
 PUBLISHED = 30_000  # steps that 3DGS's rates are for
 TRAVEL, FASTEST = 10.0, 5e-2  # a features' rate: less than TRAVEL over all steps does not arrive
 DEPTH_WEIGHT = 0.8
@@ -51,15 +50,6 @@ class Default:
     by: str
 
 
-def _steps(_: TrainSection, evidence: Evidence) -> int:
-    """Steps by pixels, tuned on held-out views (docs/results/training.md, "How many steps").
-
-    70 photos of 320x240 pixels are best after 1500 steps, and lose 0.5 dB again until 3000; 43 of
-    360x640 gain until 3000.
-    """
-    return min(max(100 * round(2.8 * evidence.n_pixels / 1e6), FEWEST), MOST_STEPS)
-
-
 def _feature_every(_: TrainSection, evidence: Evidence) -> int:
     """Features in one step of four are as accurate as in each, for less than half of their time.
 
@@ -86,10 +76,10 @@ def _by_steps(published: float, power: float) -> Default:
 
     def rate(train: TrainSection, _: Evidence) -> float:
         assert train.steps is not None
-        return published * max(PUBLISHED / max(train.steps, FEWEST), 1) ** power
+        return published * max(PUBLISHED / max(train.steps, FEWEST_STEPS), 1) ** power
 
     return Default(
-        rate, f"steps, taken as {FEWEST} to 30,000: {published:g} (30,000 / steps)^{power:g}"
+        rate, f"steps, taken as {FEWEST_STEPS} to 30,000: {published:g} (30,000 / steps)^{power:g}"
     )
 
 
@@ -104,7 +94,10 @@ def _exposure(_: TrainSection, evidence: Evidence) -> str:
 
 
 DEFAULTS = {  # in this order: a later one may depend on an earlier
-    "steps": Default(_steps, "pixels of the training photos: 280 a megapixel, from 1000 to 3000"),
+    "steps": Default(
+        lambda _, evidence: default_steps(evidence.n_pixels),
+        "pixels of the training photos: 280 a megapixel, from 1000 to 3000",
+    ),
     "feature_every": Default(
         _feature_every, "training views: a tenth of their number, from 1 to 4"
     ),

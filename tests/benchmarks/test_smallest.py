@@ -11,7 +11,7 @@ from PIL import Image
 from shared import ROOT, data
 
 import benchmarks.__main__ as bench
-from benchmarks import raster
+from benchmarks import raster, shared
 from benchmarks.training import cost
 from chebsplat.stages.settings import TeachSection
 
@@ -132,7 +132,19 @@ def test_the_rasterizer_s_benchmark_ends_with_1_where_a_bar_is_missed(
     assert ("MISSED" in capsys.readouterr().out) == bool(code)
 
 
-@pytest.mark.parametrize(("ratio", "code"), [(1.2, 0), (1.3, 1)])
+@pytest.mark.parametrize(
+    ("value", "relation", "met"),
+    [(1.0, ">=", True), (0.9, ">=", False), (1.0, "<=", True), (1.1, "<=", False)]
+    + [(float("nan"), relation, False) for relation in (">=", "<=")],
+)
+def test_a_bar_is_met_from_its_value_on_and_never_by_what_was_not_measured(
+    capsys, value, relation, met
+):
+    assert shared.judged([("first", 1.0, "<=", 2.0), ("what", value, relation, 1.0)]) == [True, met]
+    assert ("MISSED" in capsys.readouterr().out) == (not met)
+
+
+@pytest.mark.parametrize(("ratio", "code"), [(1.2, 0), (1.3, 1), (float("nan"), 1)])
 def test_the_cost_of_a_training_ends_with_1_where_its_bar_is_missed(
     tmp_path, monkeypatch, capsys, ratio, code
 ):

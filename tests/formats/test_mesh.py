@@ -99,7 +99,7 @@ def test_clustering_leaves_what_is_wanted_and_keeps_the_surface(monkeypatch):
 
 def test_a_missing_pymeshlab_is_named_with_what_helps(ball, monkeypatch):
     monkeypatch.setitem(sys.modules, "pymeshlab", None)
-    with pytest.raises(ConfigError, match=r"chebsplat\[mesh\].*--raw"):
+    with pytest.raises(ConfigError, match=r"the extra `mesh`: .*\[mesh\].*--raw"):
         clean_mesh(ball, 100, 0.1, 10, 0.02)
 
 

@@ -133,10 +133,10 @@ def test_a_profile_that_cannot_be_used_is_named(tmp_path, text, message):
 
 
 def test_without_the_plugin_or_slurm_a_run_there_says_what_is_missing(monkeypatch):
-    monkeypatch.setattr(cluster, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"plugin for slurm is not installed.*\[slurm\]"):
+    monkeypatch.setitem(sys.modules, cluster.PLUGIN, None)
+    with pytest.raises(ConfigError, match=r"on=slurm needs the extra `slurm`: .*\[slurm\]"):
         cluster.checked("slurm")
-    monkeypatch.setattr(cluster, "find_spec", lambda name: name)
+    monkeypatch.setattr(cluster, "require", lambda *_: None)
     monkeypatch.setattr(cluster.shutil, "which", lambda name: None)
     with pytest.raises(ConfigError, match="no sbatch on the PATH"):
         cluster.checked("slurm")

