@@ -265,7 +265,7 @@ def sentence(plan: Plan, found: Forecast | None, cores: int, device: str) -> str
     said += (
         f"about {duration(found.total)} on {where}, {max(round(found.megabytes, -1), 10):.0f} MB"
         if found.seconds
-        else "nothing to run"
+        else "all is done"
     )
     if plan.left_out.get("teacher", "").startswith(UNASKED):
         said += f"; colour only: for names run `{FETCH}`"

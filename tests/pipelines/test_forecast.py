@@ -185,3 +185,8 @@ def test_more_cores_and_a_gpu_shorten_what_uses_them():
     assert forecasts.BEGIN * len(two) == pytest.approx(
         expected("office0")[1].total - sum(two.values())
     )
+
+
+def test_a_scene_that_is_finished_takes_no_time():
+    plan = Planner().plan("toy")
+    assert sentence(plan, forecast(plan, [], 2, "cpu"), 2, "cpu") == "16 photos, all is done"

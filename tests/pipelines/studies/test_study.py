@@ -565,7 +565,7 @@ def test_a_study_that_extends_another_has_its_values_but_for_its_own_and_names_w
         ({"extends": "method-long"}, "mine: method-long itself extends parts; extend that"),
         ({"variants": ["full", "half"]}, "mine: variants: 'half' is none of full, features-only"),
         ({"conditions": ["noise"]}, "mine: conditions: 'noise' is none of"),
-        ({"variants": ["full"]}, "'features-only' is none of its variants"),
+        ({"variants": ["plain"]}, "'full' is none of its variants"),
     ],
 )
 def test_an_extension_of_what_is_not_there_is_an_error_that_names_it(changes, message):
