@@ -112,6 +112,8 @@ def test_a_word_is_found_in_the_scene_and_drawn_by_render(folder, tmp_path):
     command = [
         "render",
         "words",
+        "--path",
+        "capture",
         "--what",
         "relevancy",
         "--query",
