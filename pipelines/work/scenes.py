@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import tomllib
@@ -14,6 +15,8 @@ from chebsplat.formats.names import suggest
 from chebsplat.formats.videos import is_video
 from chebsplat.pipelines.work.store import is_name
 from chebsplat.stages.sources.common import detect
+
+log = logging.getLogger("chebsplat")
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 ONE = {
@@ -58,6 +61,20 @@ def shown(text: str) -> str:
 def expanded(text: str) -> str:
     """`${NAME:-default}` by the environment."""
     return VARIABLE.sub(lambda found: os.environ.get(found[1]) or found[2], text)
+
+
+def beside(scene: str) -> str:
+    """What a user called a scene; the path of the folder or video beside, where a scene of ours has
+    the same name, which a line says.
+    """
+    if scene not in names("scenes") or not is_source(scene):
+        return scene
+    log.warning(
+        "%s is taken to be the folder here, not chebsplat's scene of this name; for that run "
+        "elsewhere, with CHEBSPLAT_WORK, or rename the folder",
+        scene,
+    )
+    return f"./{scene}"
 
 
 def folder_of(scene: str) -> Path | None:
