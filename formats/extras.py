@@ -47,5 +47,5 @@ def extra(
 def missing(package: str, what: str, otherwise: str, error: type[ChebsplatError]) -> ChebsplatError:
     """The error that says what needs an extra, and how it is installed."""
     name = EXTRAS[package]
-    said = f"{what} needs the extra `{name}`: .venv/bin/pip install -e '.[{name}]' installs it"
-    return error(said + (f"; or {otherwise}" if otherwise else ""))
+    text = f"{what} needs the extra `{name}`: .venv/bin/pip install -e '.[{name}]' installs it"
+    return error(text + (f"; or {otherwise}" if otherwise else ""))

@@ -6,6 +6,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.names import suggest
 from chebsplat.pipelines.planning import sequences
 from chebsplat.pipelines.planning.plan import Overrides, Plan, Planner, merged, overrides
+from chebsplat.pipelines.work.scenes import beside
 from chebsplat.stages.registry import STAGES
 
 
@@ -22,7 +23,8 @@ def plans(
 ) -> list[Plan]:
     """The plan of a scene, or the plans of a sequence.
 
-    knowledge: `knowledge.start`, if any; newer, quality: as of `Planner`.
+    scene: of a scene of ours and a folder beside that are called alike, the folder; knowledge:
+    `knowledge.start`, if any; newer, quality: as of `Planner`.
     """
     if (scene is None) == (sequence is None):
         raise ConfigError("name one of scene= and sequence=")
@@ -32,7 +34,7 @@ def plans(
     try:
         if sequence is not None:
             return sequences.plan_sequence(planner, sequence, settings, ablation)
-        return [planner.plan(str(scene), settings, ablation)]
+        return [planner.plan(beside(str(scene)), settings, ablation)]
     finally:
         planner.save()
 

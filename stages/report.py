@@ -6,7 +6,7 @@ import csv
 import json
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -57,6 +57,37 @@ SMALLER = ("split", "ragged")
 FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 
 
+class Figure(NamedTuple):
+    """A row of the table of figures.
+
+    name: with the unit. scene, teacher: a number, several by what each is of, None where it was not
+      measured, "" where there is none. form: of a number on the page; words: instead of it there.
+    """
+
+    name: str
+    scene: Any
+    teacher: Any = ""
+    form: str = "{:,}"
+    words: str = ""
+
+    def on_page(self) -> tuple[str, str, str]:
+        """Name, scene and teacher as people read them."""
+        if isinstance(self.scene, dict):
+            values = " / ".join(self.form.format(value) for value in self.scene.values())
+            return f"{self.name} {' / '.join(map(str, self.scene))}", values, ""
+        scene, teacher = (
+            value if value == "" else "not measured" if value is None else self.form.format(value)
+            for value in (self.scene, self.teacher)
+        )
+        return self.name, self.words or scene, teacher
+
+    def in_table(self) -> list[list[Any]]:
+        """Rows of a CSV, numbers as numbers and nothing where there is none."""
+        if isinstance(self.scene, dict):
+            return [[f"{self.name} {of}", value, ""] for of, value in self.scene.items()]
+        return [[self.name, self.scene, self.teacher]]
+
+
 def run(job: Job) -> None:
     """One HTML page, and the figures as CSV, of a scene's measurements and their origin.
 
@@ -91,7 +122,8 @@ def run(job: Job) -> None:
         facts.get("refined")
     )
     rows += agreement_rows(facts.get("agreement")) + clock_rows(manifests["gaussians"])
-    write_table(job.out / "figures.csv", rows)
+    table = [row for figure in rows for row in figure.in_table()]
+    write_table(job.out / "figures.csv", [["figure", "scene", "2D teacher"], *table])
     write_table(
         job.out / "trace.csv",
         [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)],
@@ -110,7 +142,7 @@ def run(job: Job) -> None:
         protocol=figures["protocol"],
         teacher=teacher_words(facts["features"]) if "features" in facts else None,
         doubt=facts.get("agreement", {}).get("doubt"),
-        rows=rows[1:],
+        rows=[figure.on_page() for figure in rows],
         tiles=parts.tiles(figures, gaussians),
         legend=parts.legend(pixels, names, colors),
         classes=parts.class_rows(figures, colors),
@@ -148,8 +180,8 @@ def psnr_of_one_color(evaluation: Evaluation) -> float:
     return min(psnr(flat, photos), 100.0)
 
 
-def clock_rows(training: Manifest) -> list[list[str]]:
-    """(figure, scene, teacher) of a training by the clock, whose steps depend on the machine."""
+def clock_rows(training: Manifest) -> list[Figure]:
+    """Steps of a training by the clock, which depend on the machine."""
     seconds = training.config.get("train", {}).get("seconds")
     if seconds is None:
         return []
@@ -157,7 +189,7 @@ def clock_rows(training: Manifest) -> list[list[str]]:
         f"steps within {seconds:g} s by the clock (train.seconds, measured on "
         f"{measured_on(training)})"
     )
-    return [[what, f"{training.facts['steps']:,}", ""]]
+    return [Figure(what, training.facts["steps"])]
 
 
 def describe_poses(model: PhotoModel) -> dict[str, Any]:
@@ -218,25 +250,20 @@ def summary_rows(
     by_degree: list[int] | None,
     trained: dict[str, Any],
     timed: dict[str, str],
-) -> list[list[str]]:
-    """Header, then (figure, scene, teacher), "not measured" where there is no figure.
+) -> list[Figure]:
+    """Figures of the evaluation and the training.
 
     Args: by_degree: Gaussians by SH degree, None where unknown; trained: facts of the training;
       timed: the machines that `evaluation` and training (`gaussians`) were measured on.
     """
-
-    def write(value: float | None, form: str) -> str:
-        return "not measured" if value is None else form.format(value)
-
     image = figures["image"]
     of = ", of undistorted photos" if "undistorted" in figures["source"] else ""
     rows = [
-        ["figure", "scene", "2D teacher"],
-        [f"PSNR, dB (8-bit, mean over views{of})", f"{image['psnr']:.2f}", ""],
-        ["PSNR after a colour fit by view, dB", write(image.get("psnr_fit"), "{:.2f}"), ""],
+        Figure(f"PSNR, dB (8-bit, mean over views{of})", image["psnr"], form="{:.2f}"),
+        Figure("PSNR after a colour fit by view, dB", image.get("psnr_fit"), form="{:.2f}"),
         *taken_rows(image.get("as_taken")),
-        ["SSIM (window 11, σ 1.5)", f"{image['ssim']:.4f}", ""],
-        ["LPIPS (vgg, images in [0, 1])", write(figures["lpips"], "{:.3f}"), ""],
+        Figure("SSIM (window 11, σ 1.5)", image["ssim"], form="{:.4f}"),
+        Figure("LPIPS (vgg, images in [0, 1])", figures["lpips"], form="{:.3f}"),
     ]
     segmentation = figures.get("segmentation") or {}
     names = {
@@ -250,27 +277,25 @@ def summary_rows(
     for key, name in names.items():
         if key in segmentation.get("scene", {}):
             teacher = segmentation.get("teacher")
-            values = [segmentation["scene"][key], teacher[key] if teacher else None]
             of_truth = f" ({words})" if (words := rests(segmentation, key)) else ""
             rows.append(
-                [
-                    name + of_truth,
-                    write(values[0], "{:.1%}"),
-                    write(values[1], "{:.1%}") if teacher else "",
-                ]
+                Figure(
+                    f"{name}, %{of_truth}",
+                    percent(segmentation["scene"][key]),
+                    percent(teacher[key]) if teacher else "",
+                    "{:.1f}",
+                )
             )
-    rows.append(["Gaussians", f"{figures['n_gaussians']:,}", ""])
+    rows.append(Figure("Gaussians", figures["n_gaussians"]))
     if by_degree is not None:
-        rows.append(
-            ["Gaussians of SH degree 0, 1, 2, 3", " / ".join(f"{n:,}" for n in by_degree), ""]
-        )
+        rows.append(Figure("Gaussians of SH degree", dict(enumerate(by_degree))))
     whole = figures["bytes"]["unpruned_ply"]
     for name, size in figures["bytes"].items():
-        share = f" ({size / whole:.0%} of plain 3DGS)" if name in SMALLER else ""
-        rows.append([f"bytes, {BYTES[name]}", f"{size:,}{share}", ""])
+        share = f"{size:,} ({size / whole:.0%} of plain 3DGS)" if name in SMALLER else ""
+        rows.append(Figure(f"bytes, {BYTES[name]}", size, words=share))
     on = f"measured on {timed['evaluation']}"
     rows += [
-        [f"frames/s, {FRAMES[name]} ({on})", f"{v:.1f}", ""]
+        Figure(f"frames/s, {FRAMES[name]} ({on})", v, form="{:.1f}")
         for name, v in figures["frames_per_second"].items()
     ]
     if split := figures["milliseconds"]:
@@ -278,62 +303,65 @@ def summary_rows(
         under = f"{split['width']}x{split['height']}, {threads}, {split['device']}, {on}"
         parts = {"projection": "projection", "sh": "SH", "sort": "sort", "blend": "blend"}
         rows += [
-            [f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""]
+            Figure(f"ms a frame, {name} ({under})", split[part], form="{:.2f}")
             for part, name in parts.items()
         ]
     on = f"measured on {timed['gaussians']}"
     rows += [
-        [f"ms a training step, {part} ({on})", f"{v:.2f}", ""]
+        Figure(f"ms a training step, {part} ({on})", v, form="{:.2f}")
         for part, v in trained["milliseconds"].items()
     ]
     if peak := trained.get("peak_device_bytes"):
-        rows.append(["bytes of the GPU's memory in training, at most", f"{peak:,}", ""])
+        rows.append(Figure("bytes of the GPU's memory in training, at most", peak))
     return rows
 
 
-def taken_rows(figures: dict[str, Any] | None) -> list[list[str]]:
-    """Rows of figures on the test photos as taken; none where these are the test views."""
+def percent(share: float | None) -> float | None:
+    """A share in hundredths; None where it was not measured."""
+    return None if share is None else 100 * share
+
+
+def taken_rows(figures: dict[str, Any] | None) -> list[Figure]:
+    """Figures on the test photos as taken; none where these are the test views."""
     if figures is None:
         return []
     size = "{}×{}".format(*figures["size"])
     return [
-        [f"PSNR on the photos as taken, {size} pixels, dB", f"{figures['psnr']:.2f}", ""],
-        ["SSIM on them", f"{figures['ssim']:.4f}", ""],
+        Figure(f"PSNR on the photos as taken, {size} pixels, dB", figures["psnr"], form="{:.2f}"),
+        Figure("SSIM on them", figures["ssim"], form="{:.4f}"),
     ]
 
 
-def refined_rows(facts: dict[str, Any] | None) -> list[list[str]]:
-    """(figure, scene, teacher) of refined features: the choices, and the agreements behind them."""
+def refined_rows(facts: dict[str, Any] | None) -> list[Figure]:
+    """Refined features: the choices, and the agreements behind them."""
     if facts is None:
         return []
-    changed = {name: facts.get(f"changed_by_{name}") for name in ("smoothing", "knowledge")}
-    words = {
-        name: "" if share is None else f", {share:.1%} of the labels changed"
-        for name, share in changed.items()
-    }
     counts = f"counts as {facts['strength']:g} views" if facts["strength"] else "none"
     if (familiar := facts.get("familiar", 1.0)) < 1:
         counts += f"; the teacher is unsure of this scene, its views count for {familiar:.2f}"
+    smooth = bool(facts["smooth"])
     rows = [
-        ["smoothing of features", ("on" if facts["smooth"] else "off") + words["smoothing"], ""],
-        ["knowledge in features", counts + words["knowledge"], ""],
+        Figure("smoothing of features (1: on)", int(smooth), words="on" if smooth else "off"),
+        Figure("knowledge in features, views that it counts as", facts["strength"], words=counts),
     ]
-    for name, curve in facts["curve"].items():
-        values = " / ".join(f"{value:.4f}" for value in curve.values())
-        figure = f"agreement of half the training views with the other, smoothing {name}, at k = "
-        rows.append([figure + " / ".join(curve), values, ""])
-    return rows
+    rows += [
+        Figure(f"labels changed by {name}, %", percent(share), form="{:.1f}")
+        for name in ("smoothing", "knowledge")
+        if (share := facts.get(f"changed_by_{name}")) is not None
+    ]
+    half = "agreement of half the training views with the other, smoothing"
+    return rows + [
+        Figure(f"{half} {name}, at k =", curve, form="{:.4f}")
+        for name, curve in facts["curve"].items()
+    ]
 
 
-def agreement_rows(facts: dict[str, Any] | None) -> list[list[str]]:
-    """(figure, scene, teacher) of the views' agreement on labels of points by their 2D teacher."""
+def agreement_rows(facts: dict[str, Any] | None) -> list[Figure]:
+    """The views' agreement on labels of points by their 2D teacher."""
     if facts is None:
         return []
-    value, count = facts["agreement"], facts["n_points"]
-    text = "not measured" if value is None else f"{value:.2f}"
-    return [
-        [f"agreement of views on labels of {count:,} points (1: always, 0: by chance)", "", text]
-    ]
+    name = f"agreement of views on labels of {facts['n_points']:,} points (1: always, 0: by chance)"
+    return [Figure(name, "", facts["agreement"], "{:.2f}")]
 
 
 def write_table(path: Path, rows: list[list[Any]]) -> None:

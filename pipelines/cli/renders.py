@@ -11,20 +11,18 @@ from typing import Any
 
 import click
 
-from chebsplat.errors import InputError
+from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.splats import is_splat
 from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath
 
-PATH = click.option(
-    "--path",
-    default="capture",
-    show_default=True,
-    help="orbit, capture, or a cameras.json or transforms.json",
-)
+VIDEO = ".mp4"
+PATHS = "flight (along the capture's cameras, smoothed and level; of a splat alone within it), \
+orbit, capture, or a cameras.json or transforms.json"
 FRAMES = click.option(
     "--frames",
     type=click.IntRange(1, 100_000),
-    help="of an orbit (default: 120), or of a flight through other cameras (default: none)",
+    help="of an orbit (default: 120) or a flight (by its length), or of a path through other "
+    "cameras (default: none)",
 )
 SIZE = click.option(
     "--size", help="WIDTHxHEIGHT in pixels, such as 1280x960; default: the cameras' own"
@@ -43,9 +41,28 @@ WORDS = click.option(
 )
 
 
+class FramesPath(click.ParamType):
+    """A folder, which has no ending, or a video, whose ending is .mp4."""
+
+    name = "path"
+
+    def convert(self, value: Any, param: Any, context: click.Context | None) -> Path:
+        path = Path(value)
+        if path.suffix[1:2].isalpha() and path.suffix.lower() != VIDEO and not path.is_dir():
+            raise ConfigError(
+                f"{path}: frames go into a folder, whose name has no ending, or into a video that "
+                f"ends in {VIDEO}; choose another --out"
+            )
+        return path
+
+
 @click.command()
 @click.argument("scene")
-@PATH
+@click.option(
+    "--path",
+    default="auto",
+    help=f"{PATHS}; default: orbit where the cameras look inwards, else flight",
+)
 @FRAMES
 @UP
 @click.option(
@@ -60,9 +77,7 @@ WORDS = click.option(
 @click.option(
     "--fps", type=click.IntRange(1, 240), default=24, show_default=True, help="of a video"
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="a folder of frames, or a .mp4"
-)
+@click.option("--out", type=FramesPath(), required=True, help="a folder of frames, or a .mp4")
 def render(
     scene: str,
     path: str,
@@ -82,7 +97,7 @@ def render(
     from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
     from chebsplat.stages.tools.frames import Shot, kinds_of, library, render_frames, render_video
 
-    is_video = out.suffix == ".mp4"
+    is_video = out.suffix.lower() == VIDEO
     if is_video:
         library()  # fails on a missing extra before a scene is opened
     opened, pixels, query = load(scene), size_of(size), of_query["query"]
@@ -99,7 +114,7 @@ def render(
 
 @click.command()
 @click.argument("scene")
-@PATH
+@click.option("--path", default="capture", show_default=True, help=PATHS)
 @FRAMES
 @UP
 @SIZE

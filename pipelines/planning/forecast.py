@@ -1,5 +1,5 @@
-"""How long the steps of a plan will take, and how much they will write, by what is known before:
-the photos, their pixels, settings, and the seconds of scenes that this machine has finished.
+"""Forecast of the seconds and megabytes of a plan: by photos, pixels and settings, corrected by the
+seconds of scenes that this machine has finished.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ N_FINISHED = 8  # scenes whose seconds count, the newest
 
 
 @dataclass(frozen=True)
-class Known:
+class SceneFacts:
     """Facts of a scene before it is run.
 
-    kind: of its source. taken, posed, seen: megapixels of all photos as they were taken, and as
+    kind: of its source. raw, posed, trained: megapixels of all photos as they were taken, and as
     `pose` and `ingest` reduce them. pairs: of photos that `pose` matches. steps, clock: of the
     training, clock: s, None: as long as the steps take. gaussians: at most. model: a 2D teacher's
     model is run.
@@ -47,9 +47,9 @@ class Known:
 
     kind: str
     photos: int
-    taken: float
+    raw: float
     posed: float
-    seen: float
+    trained: float
     pairs: int
     steps: int
     clock: float | None
@@ -60,30 +60,28 @@ class Known:
 
     @property
     def rich(self) -> float:
-        """How full of features a photo is: small ones have fewer."""
+        """Features of a photo, as a share of a large one's."""
         return min(self.posed / self.photos / LARGEST, 1)
 
     @property
     def step(self) -> float:
         """Seconds of a training step."""
-        colour = 0.010 + 0.075 * min(self.seen / self.photos, LARGEST)
+        colour = 0.010 + 0.075 * min(self.trained / self.photos, LARGEST)
         colour *= 0.5 + 0.5 * self.gaussians / 40_000
         return colour * (8 if self.printed else 1.2 if self.semantic else 1)
 
 
 # s of a stage on two idle cores of an AMD EPYC: fitted to generated rooms, fox, redkitchen,
 # house_kitchen and seven captures of photos at 640 to 1600 pixels, within a factor of 1.5 for most
-SECONDS: dict[str, Callable[[Known], float]] = {
-    "pose": lambda k: (
-        2 + 0.06 * k.taken + 0.6 * k.posed + (0.3 * k.photos + 0.04 * k.pairs) * k.rich
-    ),
+SECONDS: dict[str, Callable[[SceneFacts], float]] = {
+    "pose": lambda k: 2 + 0.06 * k.raw + 0.6 * k.posed + (0.3 * k.photos + 0.04 * k.pairs) * k.rich,
     "ingest": lambda k: (
-        0.5 + 2.4 * k.seen if k.kind == "generated" else 0.5 + 0.03 * k.taken + 0.4 * k.seen
+        0.5 + 2.4 * k.trained if k.kind == "generated" else 0.5 + 0.03 * k.raw + 0.4 * k.trained
     ),
     # transforms bring no points, and poses that a depth camera tracks are adjusted
-    "sfm": lambda k: 0.5 + {"transforms": 1.0, "seven_scenes": 2.6}.get(k.kind, 0.3) * k.seen,
+    "sfm": lambda k: 0.5 + {"transforms": 1.0, "seven_scenes": 2.6}.get(k.kind, 0.3) * k.trained,
     "channels": lambda k: 0.1,
-    "teacher": lambda k: 1.5 + 0.45 * k.seen if k.model else 0.5 + 0.1 * k.seen,
+    "teacher": lambda k: 1.5 + 0.45 * k.trained if k.model else 0.5 + 0.1 * k.trained,
     "agree": lambda k: 0.6,
     "describe": lambda k: 3.0,
     "encode": lambda k: 1.6,
@@ -91,29 +89,27 @@ SECONDS: dict[str, Callable[[Known], float]] = {
     "recall": lambda k: 0.5,
     "onnx": lambda k: 0.6,
     "train": lambda k: k.clock or 3 + k.step * k.steps,
-    "lift": lambda k: 0.7 + 0.02 * k.seen,
+    "lift": lambda k: 0.7 + 0.02 * k.trained,
     "refine": lambda k: 1.0,
     "export": lambda k: 0.1,
-    "evaluate": lambda k: 1 + 0.2 * k.seen,
+    "evaluate": lambda k: 1 + 0.2 * k.trained,
     "report": lambda k: 0.8,
 }
-MEGABYTES: dict[str, Callable[[Known], float]] = {
+MEGABYTES: dict[str, Callable[[SceneFacts], float]] = {
     "pose": lambda k: 0.5,
-    "ingest": lambda k: 2.7 * k.seen,
+    "ingest": lambda k: 2.7 * k.trained,
     "sfm": lambda k: 2.3,
-    "teacher": lambda k: 3 * k.seen if k.model else k.seen,
+    "teacher": lambda k: 3 * k.trained if k.model else k.trained,
     "describe": lambda k: 19,
     "encode": lambda k: 24,
     "train": lambda k: (14 if k.semantic else 8) * k.gaussians / 40_000,
     "lift": lambda k: 10 * k.gaussians / 40_000,
     "refine": lambda k: 4 * k.gaussians / 40_000,
     "export": lambda k: 18 * k.gaussians / 40_000,
-    "evaluate": lambda k: 0.5 * k.seen,
+    "evaluate": lambda k: 0.5 * k.trained,
     "report": lambda k: 2,
 }
-ON_GPU = (
-    0.3  # of the CPU's seconds, for a stage that computes on a GPU: an H200 trains in this part
-)
+ON_GPU = 0.3  # of the CPU's seconds, for a stage that computes on a GPU: an H200's training
 
 
 @dataclass(frozen=True)
@@ -133,8 +129,8 @@ class Forecast:
         return sum(self.seconds.values()) + BEGIN * len(self.seconds)
 
 
-def known(stages: Mapping[str, dict[str, Any]], fewer: int | None = None) -> Known | None:
-    """What a scene's settings and source tell before it is run; None where no photo can be read.
+def facts_of(stages: Mapping[str, dict[str, Any]], fewer: int | None = None) -> SceneFacts | None:
+    """Facts of a scene by its settings and source; None where no photo can be read.
 
     Args: stages: sections of the config by stage, of a plan or of a finished scene; fewer: photos,
       in the place of more.
@@ -147,19 +143,19 @@ def known(stages: Mapping[str, dict[str, Any]], fewer: int | None = None) -> Kno
             n = min(n, MOST)
         n = min(filter(None, (n, pose.get("max_views"), ingest["max_views"], fewer)))
         area, side = width * height / 1e6, max(width, height)
-        seen = area * min(1, ingest["max_side"] / side) ** 2
+        reduced = area * min(1, ingest["max_side"] / side) ** 2
         train = stages.get("train", {}).get("train", {})
         teacher = stages.get("teacher", {}).get("teacher", {})
         all_pairs = pose.get("matching") == "exhaustive" or n <= EXHAUSTIVE
         n_training = n - n // (ingest["test_every"] or 8)
-        return Known(
+        return SceneFacts(
             source["kind"],
             n,
             n * area,
             n * area * min(1, pose.get("max_side", side) / side) ** 2,
-            n * seen,
+            n * reduced,
             n * (n - 1) // 2 if all_pairs else round(0.6 * pose.get("n_matched", 10) * n),
-            train.get("steps") or default_steps(n_training * seen * 1e6),
+            train.get("steps") or default_steps(n_training * reduced * 1e6),
             train.get("seconds"),
             train.get("max_gaussians", 0),
             train.get("method") == "printed",
@@ -199,23 +195,23 @@ def rates(cores: int, device: str) -> dict[str, float]:
     spent, awaited = dict.fromkeys(SECONDS, KNOWN), dict.fromkeys(SECONDS, KNOWN)
     newest = sorted(finished.titles(), key=lambda title: -(base / title).stat().st_mtime)
     for title in newest[:N_FINISHED]:
-        made = {}
+        manifests = {}
         for stage, path in finished.links(base / title).items():
             with suppress(InputError):  # damaged: nothing can be learnt of it
-                made[stage] = parse_manifest(path)
+                manifests[stage] = parse_manifest(path)
         try:
-            of = known({stage: manifest.config for stage, manifest in made.items()})
+            of = facts_of({stage: manifest.config for stage, manifest in manifests.items()})
         except KeyError:  # of a study, or made by another version, with other settings
             continue
-        for stage in made.keys() & SECONDS:
-            if of is not None and is_alike(made[stage], cores, device):
-                spent[stage] += idle_seconds(made[stage])
+        for stage in manifests.keys() & SECONDS:
+            if of is not None and is_alike(manifests[stage], cores, device):
+                spent[stage] += idle_seconds(manifests[stage])
                 awaited[stage] += defaults[stage] * SECONDS[stage](of)
     return {stage: defaults[stage] * spent[stage] / awaited[stage] for stage in SECONDS}
 
 
 def is_alike(manifest: Manifest, cores: int, device: str) -> bool:
-    """Whether an artifact was made on this processor, with so many threads, on such a device."""
+    """True for an artifact made on this processor, with so many threads, on such a device."""
     return bool(manifest.processes) and all(
         (of["processor"], of["threads"]) == (processor(), cores)
         and manifest.device == device_of(manifest.stage, device)
@@ -241,38 +237,39 @@ def idle_seconds(manifest: Manifest) -> float:
 def forecast(plan: Plan, steps: Iterable[Step], cores: int, device: str) -> Forecast | None:
     """Forecast of `steps` of a plan, which are to run; None where no photo can be read."""
     sections = {step.stage: step.sections for step in plan.steps}
-    now, stages = known(sections), [step.stage for step in steps]
+    now, stages = facts_of(sections), [step.stage for step in steps]
     if now is None:
         return None
     factors = rates(cores, device)
 
-    def seconds(of: Known) -> dict[str, float]:
+    def seconds(of: SceneFacts) -> dict[str, float]:
         return {stage: SECONDS[stage](of) * factors[stage] for stage in stages}
 
-    found, saved = seconds(now), 0.0
-    if now.photos > MANY and (fewer := known(sections, MANY)):
-        saved = sum(found.values()) - sum(seconds(fewer).values())
+    expected, saved = seconds(now), 0.0
+    if now.photos > MANY and (fewer := facts_of(sections, MANY)):
+        saved = sum(expected.values()) - sum(seconds(fewer).values())
     size = sum(MEGABYTES[stage](now) for stage in stages if stage in MEGABYTES)
-    return Forecast(now.photos, found, size, saved)
+    return Forecast(now.photos, expected, size, saved)
 
 
-def sentence(plan: Plan, found: Forecast | None, cores: int, device: str) -> str:
+def sentence(plan: Plan, expected: Forecast | None, cores: int, device: str) -> str:
     """A forecast in words, with what a scene of colour alone lacks and what fewer photos save."""
-    if found is None:
+    if expected is None:
         return "no forecast: none of its photos can be read"
     where = f"{cores} core{'s' * (cores > 1)}" + " and the GPU" * (device == "cuda")
-    said = f"{found.photos} photos, "
-    said += (
-        f"about {duration(found.total)} on {where}, {max(round(found.megabytes, -1), 10):.0f} MB"
-        if found.seconds
+    text = f"{expected.photos} photos, "
+    megabytes = max(round(expected.megabytes, -1), 10)
+    text += (
+        f"about {duration(expected.total)} on {where}, {megabytes:.0f} MB"
+        if expected.seconds
         else "all is done"
     )
     if plan.left_out.get("teacher", "").startswith(UNASKED):
-        said += f"; colour only: for names run `{FETCH}`"
-    if found.saved > BEGIN:
+        text += f"; colour only: for names run `{FETCH}`"
+    if expected.saved > BEGIN:
         setting = "pose" if "pose" in plan.targets else "ingest"
-        said += (
-            f"; {MANY} of the photos would take about {duration(found.saved)} less: "
+        text += (
+            f"; {MANY} of the photos would take about {duration(expected.saved)} less: "
             f"set={setting}.max_views={MANY}"
         )
-    return said
+    return text

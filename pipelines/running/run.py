@@ -58,10 +58,10 @@ def execute(
     stale = [step for step in steps.values() if not step.fresh]
     for plan in plans:
         awaited = [step for step in plan.steps if step.key in steps and not step.fresh]
-        found = forecast(plan, awaited, cores, device)
+        estimate = forecast(plan, awaited, cores, device)
         for step in awaited:
-            step.expected = found.seconds[step.stage] if found else None
-        say(f"{plan.title}: {sentence(plan, found, cores, device)}")
+            step.expected = estimate.seconds[step.stage] if estimate else None
+        say(f"{plan.title}: {sentence(plan, estimate, cores, device)}")
         say(f"{plan.title}: {plan.source}")
         if is_verbose():
             for what, why in plan.left_out.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import tomllib
@@ -14,6 +15,8 @@ from chebsplat.formats.names import suggest
 from chebsplat.formats.videos import is_video
 from chebsplat.pipelines.work.store import is_name
 from chebsplat.stages.sources.common import detect
+
+log = logging.getLogger("chebsplat")
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 ONE = {
@@ -61,6 +64,18 @@ def escape_text(text: str) -> str:
 def expand_variables(text: str) -> str:
     """`${NAME:-default}` by the environment."""
     return VARIABLE.sub(lambda match: os.environ.get(match[1]) or match[2], text)
+
+
+def beside(scene: str) -> str:
+    """The scene, or the path of the folder or video beside that has the same name, with a warning."""
+    if scene not in names("scenes") or not is_source(scene):
+        return scene
+    log.warning(
+        "%s is taken to be the folder here, not chebsplat's scene of this name; for that run "
+        "elsewhere, with CHEBSPLAT_WORK, or rename the folder",
+        scene,
+    )
+    return f"./{scene}"
 
 
 def folder_of(scene: str) -> Path | None:

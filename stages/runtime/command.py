@@ -145,7 +145,7 @@ def publish(
     device = stage.device(device, settings)
     computed = {} if device == "cpu" else {"device": device}
     planned = planned or Planned()
-    shown = Progress(expected=planned.expected)
+    progress = Progress(expected=planned.expected)
     key = planned.key or artifact.digest(
         {"stage": name, "config": settings, "inputs": sources} | computed
     )
@@ -167,9 +167,9 @@ def publish(
         code=planned.code,
     )
     scratch, watch = out.parent / f".part-{out.name}", Stopwatch(n_threads(), name_of(device))
-    with artifact.publish(out, manifest, force) as tmp, shown.alive(), planned.within:
-        job = Job(inputs, job_config, tmp, scratch, device, shown, manifest.facts, watch)
-        with shown.log_to(tmp / "log.jsonl"):
+    with artifact.publish(out, manifest, force) as tmp, progress.alive(), planned.within:
+        job = Job(inputs, job_config, tmp, scratch, device, progress, manifest.facts, watch)
+        with progress.log_to(tmp / "log.jsonl"):
             run(job)
         manifest.processes = watch.processes()
         manifest.seconds = round(sum(of["seconds"] for of in manifest.processes), 3)

@@ -89,7 +89,7 @@ class Progress:
             log.info("%s", line)
 
     def _left(self, ran: float = 0.0, rest: float | None = None) -> str:
-        """How long all will take still, in words; empty where nothing is known.
+        """Time left for all, in words; empty where nothing is known.
 
         Args: ran: s that a loop has run, and rest: s that it needs by its own rate.
         Choices: items of a loop differ in cost, and other loops follow: of what is said the rate
@@ -131,19 +131,19 @@ class Progress:
         began = last = time.perf_counter()
         # the first item warms up and is not counted in the rate
         try:
-            for done, item in enumerate(items):
+            for index, item in enumerate(items):
                 yield item, status
                 now = time.perf_counter()
-                if done == 0:
+                if index == 0:
                     began = now
-                at = done + start + 1
+                at = index + start + 1
                 n = total if isinstance(total, int) else total()
                 if now - last >= (0.2 if self.show else self.every) or at == n:
                     last = now
-                    rate = done / max(now - began, 1e-9)
+                    rate = index / max(now - began, 1e-9)
                     rest = (n - at) / rate if rate > 0 and at < n else None
                     notes = "".join(f"  {k} {v}" for k, v in status.items())
-                    self._bar = f"{what} {at}/{n}{notes}" + (f"  {rate:.1f}/s" if done else "")
+                    self._bar = f"{what} {at}/{n}{notes}" + (f"  {rate:.1f}/s" if index else "")
                     self._say(
                         self._bar + self._left(now - began, rest), end="\n" if at == n else ""
                     )

@@ -139,9 +139,7 @@ def file_of(view: int) -> str:
 
 
 def is_photo(path: Path, root: Path) -> bool:
-    """Whether an image below a source's folder is a photo by its path, not a mask, depth or label
-    map.
-    """
+    """True for an image below a source's folder that is by its path no mask, depth or label map."""
     return BESIDE.isdisjoint(re.findall("[a-z]+", str(path.relative_to(root)).lower()))
 
 

@@ -33,6 +33,8 @@ log = logging.getLogger("chebsplat")
 KINDS = ("color", "labels", "depth", "relevancy")
 SEMANTIC = ("labels", "relevancy")
 REQUEST = "frames.json"
+EMPTY = 0.05  # of a frame that is covered, below which it shows next to nothing
+N_LOOKED_AT, SMALL = 60, 64  # frames of a path that are looked at before, pixels of a side
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk
 CRF = "18"  # x264's constant rate factor, visually almost lossless
 
@@ -82,6 +84,7 @@ def render_frames(
     """
     names = file_names([f"{camera.name}.png" for camera in cameras])
     claim(out, cameras, shot, scene)
+    warn_of_empty(scene, cameras)
     files = {kind: [out / kind / f"{name}{ending(kind)}" for name in names] for kind in shot.kinds}
     missing = []
     for k, camera in enumerate(cameras):
@@ -95,6 +98,28 @@ def render_frames(
             with atomic_path(files[kind][k]) as temporary:
                 save(kind, values, temporary, len(scene.label_names or []))
     return files
+
+
+def warn_of_empty(scene: OpenedScene, cameras: Sequence[Camera]) -> None:
+    """Warn of the share of the frames of which less than 5 % is covered, before they are rendered.
+
+    Choices: of more than 60 every n-th is looked at, in a few pixels: a path shows much the same
+      in frames that follow each other.
+    """
+    sample = cameras[:: -(-len(cameras) // N_LOOKED_AT)]
+    empty = 0
+    for camera in sample:
+        scale = min(SMALL / max(camera.width, camera.height), 1.0)
+        small = camera.resized(*(max(round(scale * s), 1) for s in (camera.width, camera.height)))
+        covered = scene.depth(scene.inside(small).view())[1] >= COVERED
+        empty += int(covered.mean() < EMPTY)
+    if empty:
+        log.warning(
+            "%.0f %% of the frames show next to nothing (less than %.0f %% of each is covered); "
+            "choose another --path",
+            100 * empty / len(sample),
+            100 * EMPTY,
+        )
 
 
 def file_names(views: list[str]) -> list[str]:

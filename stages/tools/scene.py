@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -159,7 +160,11 @@ class OpenedScene:
     def understood(self, text: str, against: Sequence[str] = ()) -> Query:
         """Words in the scene's own channels. Args and errors as of `query`."""
         if self.features is None:
-            raise ConfigError(f"{self.source} has no semantics; train the scene with a teacher")
+            raise ConfigError(
+                f"{self.source} has colours alone: no 2D teacher has said what things are; make "
+                f"scene={shlex.quote(str(self.source))} set=teacher.model=MODEL.onnx (chebsplat "
+                "get-teacher segformer-b0-ade fetches one), of a splat: chebsplat lift --capture"
+            )
         if self._teacher is None:
             raise ConfigError(
                 f"{self.source} has no teacher's artifact beside it; open the scene's folder"

@@ -146,7 +146,8 @@ def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_undistorted_pho
     assert "as_taken" not in found["image"]  # its capture holds none
     timed = {"evaluation": "A", "gaussians": "B"}
     rows = [
-        summary_rows(figures, None, {"milliseconds": {}}, timed)[1][0] for figures in (whole, found)
+        summary_rows(figures, None, {"milliseconds": {}}, timed)[0].name
+        for figures in (whole, found)
     ]
     assert "undistorted" not in rows[0] and "of undistorted photos" in rows[1]
 

@@ -1,6 +1,7 @@
 """`chebsplat query` finds what words mean in a finished scene, or says why it cannot."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -117,6 +118,8 @@ def test_a_word_is_found_in_the_scene_and_drawn_by_render(folder, tmp_path):
     command = [
         "render",
         "words",
+        "--path",
+        "capture",
         "--what",
         "relevancy",
         "--query",
@@ -165,6 +168,14 @@ def small_table(folder):
     np.savez(folder / "toy.npz", names=np.array(LABELS), embeddings=vectors(LABELS))
 
 
+def leave_colours_alone(folder):
+    scene = Scene.read(folder / "words/export")
+    del scene.parameters["features"]
+    shutil.rmtree(folder / "words/export")
+    none = {"labels": None, "label_names": None, "label_embeddings": None}
+    published(folder / "words/export", replace(scene, **none))
+
+
 @pytest.mark.parametrize(
     ("damage", "arguments", "code", "said"),
     [
@@ -175,6 +186,12 @@ def small_table(folder):
         (None, ["store", "seat"], 2, "no finished scene"),
         (None, ["words", " "], 2, "empty"),
         (remove("words/teacher"), ["words", "seat"], 2, "no teacher's artifact"),
+        (
+            leave_colours_alone,
+            ["words", "seat"],
+            2,
+            "make scene=words set=teacher.model=MODEL.onnx",
+        ),
         (put("toy.onnx", "another"), ["words", "seat"], 3, "toy.onnx is not the model"),
         (small_table, ["words", "sofa"], 3, "choose with --against"),
     ],

@@ -219,10 +219,9 @@ def test_page_and_orbit_of_a_scene_take_up_as_given(scene, tmp_path):
     assert np.ptp(heights) < 1e-6  # a level round
     level = np.array([np.array(row["rotation"])[:, 0] for row in rows]) @ np.array([-1, 0, 1])
     assert np.abs(level).max() < 1e-6  # horizons are level
-    done = CliRunner().invoke(
-        main, ["render", str(scene), "--up", "z", "--out", str(tmp_path / "no")]
-    )
-    assert done.exit_code == 2 and "add --path orbit" in done.output
+    command = ["cameras", str(scene), "--up", "z", "--out", str(tmp_path / "no")]
+    done = CliRunner().invoke(main, command)
+    assert done.exit_code == 2 and "leave out --up or --path" in done.output
 
 
 def test_orbits_without_up_are_as_before_and_with_it_go_round_it():
