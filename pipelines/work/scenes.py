@@ -67,7 +67,7 @@ def expand_variables(text: str) -> str:
 
 
 def beside(scene: str) -> str:
-    """The scene, or the path of the folder or video beside that has the same name, with a warning."""
+    """The scene, or with a warning the folder or video beside that has the same name."""
     if scene not in names("scenes") or not is_source(scene):
         return scene
     log.warning(
