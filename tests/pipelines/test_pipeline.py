@@ -78,7 +78,7 @@ def docstring(tree):
 
 
 def plumbing(tree):
-    edit(tree / "stages/runtime/progress.py", "every: float = 10.0", "every: float = 5.0")
+    edit(tree / "stages/runtime/progress.py", "every: float = 6.0", "every: float = 5.0")
 
 
 def trainer_code(tree):
