@@ -1,5 +1,8 @@
 """What is exported renders as the checkpoint does, and a part of a scene is chosen as asked."""
 
+import json
+import struct
+
 import numpy as np
 import pytest
 import torch
@@ -9,12 +12,15 @@ from shared import data
 
 from chebsplat.formats.ply import read_ply, write_ply
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.splats import read_splats
+from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
 from chebsplat.rasterize import rasterize
 from chebsplat.render import SceneRenderer
 from chebsplat.splats.gaussians import activated
 from chebsplat.splats.sh import eval_sh
 from chebsplat.stages.evaluate import camera
+from chebsplat.stages.tools.up import up_of
 
 pytestmark = pytest.mark.xdist_group("toy")
 
@@ -134,14 +140,57 @@ def test_a_filter_that_makes_no_sense_is_an_error(mixed, tmp_path, arguments, co
     assert message in done.stderr
 
 
-def test_nothing_of_the_user_s_is_overwritten_and_other_formats_name_their_tool(mixed, tmp_path):
+def test_nothing_of_the_user_s_is_overwritten_and_other_formats_are_refused(mixed, tmp_path):
     (tmp_path / "a.ply").write_text("mine")
     assert run(mixed[1], "--out", tmp_path / "a.ply").exit_code == 2
     assert (tmp_path / "a.ply").read_text() == "mine"
-    for name in ("a.spz", "a.compressed.ply"):
+    for name in ("a.ksplat", "a.compressed.ply"):
         done = run(mixed[1], "--out", tmp_path / name)
         assert done.exit_code == 2
-        assert "splat-transform" in done.stderr
+        assert "name it so" in done.stderr
+
+
+@pytest.mark.parametrize("kind", ["ply", "spz", "sog", "glb"])
+def test_a_scene_leaves_as_one_file_that_stands_upright_where_asked(
+    mixed, tmp_path, kind, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    scene = load(mixed[1])
+    done = CliRunner().invoke(main, ["export", str(mixed[1]), "--as", kind])
+    path = tmp_path / f"{mixed[1].name}.{kind}"
+    assert done.exit_code == 0, done.stderr
+    assert f"bytes {path.stat().st_size:,}" in done.stderr
+    assert CliRunner().invoke(main, ["export", str(mixed[1]), "--as", kind]).exit_code == 2
+    flat = [
+        "export",
+        "--as",
+        kind,
+        str(mixed[1]),
+        "--up",
+        "x",
+        "--out",
+        str(tmp_path / f"b.{kind}"),
+    ]
+    assert CliRunner().invoke(main, flat).exit_code == 0
+    if kind == "glb":
+        plain, turned = (positions(tmp_path / name) for name in (path.name, "b.glb"))
+        up = up_of("auto", scene.parameters, scene.exported.cameras.cam_from_world)
+        heights = scene.parameters["means"] @ up, scene.parameters["means"][:, 0]
+        for found, height in zip((plain[:, 1], turned[:, 1]), heights, strict=True):
+            np.testing.assert_allclose(np.sort(found), np.sort(height), atol=1e-4)
+        return
+    plain, turned = (read_splats(tmp_path / name)[0] for name in (path.name, f"b.{kind}"))
+    images = [rendered(p, scene.exported.cameras, 0).clamp(0, 1) for p in (plain, scene.parameters)]
+    assert (images[0] - images[1]).square().mean() < 10**-3.5
+    heights = np.sort(-turned["means"][:, 1]), np.sort(scene.parameters["means"][:, 0])
+    np.testing.assert_allclose(*heights, atol=0.05)
+
+
+def positions(path):
+    raw = path.read_bytes()
+    start = 28 + struct.unpack("<I", raw[12:16])[0]
+    n = json.loads(raw[20 : start - 8])["accessors"][0]["count"]
+    return np.frombuffer(raw[start : start + 12 * n], "<f4").reshape(n, 3)
 
 
 @pytest.mark.data
