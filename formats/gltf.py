@@ -81,7 +81,8 @@ def linear_light(srgb: np.ndarray, alpha: np.ndarray | float = 1.0) -> np.ndarra
     """COLOR_0, u16 [V, 4]: display colours [V, 3] of [0, 1] in linear light, and alpha [V]."""
     light = np.where(srgb > 0.04045, ((srgb + 0.055) / 1.055) ** 2.4, srgb / 12.92)
     with_alpha = np.concatenate([light, np.broadcast_to(alpha, len(srgb))[:, None]], 1)
-    return np.rint(65535 * with_alpha).astype(np.uint16)
+    stored: np.ndarray = np.rint(65535 * with_alpha).astype(np.uint16)
+    return stored
 
 
 def write_splat_glb(

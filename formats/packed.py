@@ -35,7 +35,8 @@ class Packed:
                 (wxyz, the largest positive) as 10 bits each over ±1/√2.
     opacities:  u8 [N] of [0, 1]; colors: u8 [3, N], of SH degree 0, 1 is white.
     sh1:        i8 [9, N], coefficients of band 1, coefficient-major; only where asked for.
-    features:   i8 [C, N]; only where given.
+    features:   i8 [C, R], those that differ, and meanings: u16 [N], which of them is a Gaussian's;
+      only where given.
     """
 
     arrays: dict[str, np.ndarray]
@@ -77,7 +78,9 @@ def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
     if sh_degree:
         arrays["sh1"], ranges["sh1"] = signed(parameters["shN"][:, :3].reshape(len(colors), 9))
     if "features" in parameters:
-        arrays["features"], ranges["features"] = signed(parameters["features"])
+        dictionary, rows = np.unique(parameters["features"], axis=0, return_inverse=True)
+        arrays["features"], ranges["features"] = signed(dictionary)
+        arrays["meanings"] = rows.reshape(-1).astype(np.uint16)
     return Packed(arrays, ranges)
 
 
@@ -130,7 +133,7 @@ def unpack(packed: Packed) -> dict[str, np.ndarray]:
     if "sh1" in arrays:
         found["shN"][:, :3] = values("sh1", arrays["sh1"]).reshape(-1, 3, 3)
     if "features" in arrays:
-        found["features"] = values("features", arrays["features"])
+        found["features"] = values("features", arrays["features"])[arrays["meanings"]]
     return {name: value.astype(np.float32) for name, value in found.items()}
 
 

@@ -132,10 +132,12 @@ def read_sog(path: Path) -> tuple[dict[str, np.ndarray], int]:
                 found = picture(of, which).reshape(-1, 4)[: meta["count"]]
                 if len(found) < meta["count"]:
                     raise ValueError(f"{of} has {len(found)} pixels for {meta['count']} Gaussians")
-                return found.astype(np.int64)
+                whole_numbers: np.ndarray = found.astype(np.int64)
+                return whole_numbers
 
             def values(of: str, entries: np.ndarray) -> np.ndarray:
-                return np.array(meta[of]["codebook"], np.float64)[entries]
+                levels: np.ndarray = np.array(meta[of]["codebook"], np.float64)[entries]
+                return levels
 
             fixed = pixels("means")[:, :3] | pixels("means", 1)[:, :3] << 8
             low, high = (np.array(meta["means"][side]) for side in ("mins", "maxs"))

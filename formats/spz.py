@@ -114,7 +114,8 @@ def to_smallest_three(quats: np.ndarray) -> np.ndarray:
     words = place.astype(np.uint32)
     for entry in range(4):
         words = np.where(place == entry, words, words << 10 | fields[:, entry])
-    return words.astype("<u4").view(np.uint8).reshape(-1, 4)
+    stored: np.ndarray = words.astype("<u4").view(np.uint8).reshape(-1, 4)
+    return stored
 
 
 def read_spz(path: Path) -> tuple[dict[str, np.ndarray], int]:
@@ -164,7 +165,7 @@ def read_spz(path: Path) -> tuple[dict[str, np.ndarray], int]:
     ), degree
 
 
-def _unpacked(data: bytes, sizes: list[int]) -> list[bytearray]:
+def _unpacked(data: bytes, sizes: list[int]) -> list[bytes]:
     """The streams of version 4, of these sizes. Raises ValueError, RuntimeError or
     struct.error.
     """
@@ -178,7 +179,7 @@ def _unpacked(data: bytes, sizes: list[int]) -> list[bytearray]:
                 raise ValueError(f"stream {k} has {plain} bytes, {size} are needed")
             Zstd().decode(data[at : at + packed], stream)
             at += packed
-        streams.append(stream)
+        streams.append(bytes(stream))
     return streams
 
 

@@ -50,12 +50,12 @@ STAGE_OF = {
 BYTES = {
     "unpruned_ply": "plain 3DGS: every SH band, nothing else",
     "ply": "scene.ply: every SH band, label and SH degree",
-    "split": "PLY split by SH degree",
     "ragged": "ragged arrays",
     "semantic": "semantic arrays, beside either",
+    "spz": "scene.spz, lossy",
 }
-# layouts of what plain 3DGS holds, without the bands that were pruned
-SMALLER = ("split", "ragged")
+# of layouts that hold less than plain 3DGS a share is told
+SMALLER = ("ragged", "spz")
 FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 
 

@@ -63,7 +63,7 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
     psnr, miou, teacher = quality(measured)
     size = {
         name: text("{:.1f} MB", scaled(number(measured, "bytes", name)))
-        for name in ("ply", "split", "ragged")
+        for name in ("ply", "spz", "ragged")
     }
     others = ", ".join(f"{name} {shown}" for name, shown in size.items() if shown and name != "ply")
     segmentation = (measured or {}).get("segmentation") or {}
