@@ -15,11 +15,12 @@ from scipy.special import expit
 from chebsplat.errors import InputError
 from chebsplat.formats.packed import OTHERS, along_a_curve, raw_parameters
 from chebsplat.formats.ply import REST
-from chebsplat.formats.spz import REMEDY, least_turned
+from chebsplat.formats.spz import LARGEST, REMEDY, least_turned
 from chebsplat.formats.world import HERE, World
 
 LIGHT_STEP = 1 / 64  # of a coefficient, in the palette of light, at least
 ROUNDS = 20  # of Lloyd's, for a codebook
+DAMAGED = (ValueError, LookupError, TypeError, OSError, OverflowError)  # what others' files raise
 ACROSS = 64  # rows of the palette of light beside one another in its picture
 MOST_LIGHTS = 65_536  # rows of the palette, which two bytes count
 
@@ -120,6 +121,8 @@ def read_sog(path: Path) -> tuple[dict[str, np.ndarray], int]:
     """
     try:
         with zipfile.ZipFile(path) as whole:
+            if sum(entry.file_size for entry in whole.infolist()) > LARGEST:
+                raise ValueError(f"it has more than the {LARGEST >> 20} MiB that are read")
             meta = json.loads(whole.read("meta.json"))
             if meta["version"] != 2:
                 raise ValueError(f"version {meta['version']}")
@@ -150,7 +153,7 @@ def read_sog(path: Path) -> tuple[dict[str, np.ndarray], int]:
                 labels = pixels("shN", 1)
                 light = values("shN", palette)[labels[:, 0] | labels[:, 1] << 8]
             log_scales, colors = values("scales", pixels("scales")[:, :3]), values("sh0", shades)
-    except (ValueError, LookupError, TypeError, OSError, zipfile.BadZipFile) as error:
+    except (*DAMAGED, zipfile.BadZipFile, Image.DecompressionBombError) as error:
         line = " ".join(str(error).split())[:200]
         raise InputError(f"{path} is cut or no SOG of version 2 ({line}); {REMEDY}") from None
     place, rows = (stored[:, 3] - 252).clip(0, 3), np.arange(len(stored))

@@ -6,6 +6,7 @@ import gzip
 import json
 import logging
 import struct
+import zipfile
 
 import numpy as np
 import pytest
@@ -128,6 +129,31 @@ def test_a_stray_gaussian_costs_others_nothing_and_a_far_scene_is_refused(tmp_pa
     with pytest.raises(ConfigError, match="name it so"):
         write_splats(tmp_path / "c.compressed.ply", p)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.spz", "b.spz"]
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"version": 1}, "version 1"),
+        ({"count": N + 1000}, "pixels for"),
+        ({"means": {"files": []}}, "is cut or no SOG"),
+        ({"sh0": {"codebook": [0.0], "files": ["sh0.webp"]}}, "is cut or no SOG"),
+        ({"quats": {"files": ["meta.json"]}}, "is cut or no SOG"),
+    ],
+)
+def test_a_sog_that_says_what_it_does_not_hold_is_refused(tmp_path, change, word):
+    write_splats(tmp_path / "a.sog", given() | {"degrees": np.full(N, 3, np.uint8)})
+    with (
+        zipfile.ZipFile(tmp_path / "a.sog") as whole,
+        zipfile.ZipFile(tmp_path / "b.sog", "w") as other,
+    ):
+        for name in whole.namelist():
+            content = whole.read(name)
+            if name == "meta.json":
+                content = json.dumps(json.loads(content) | change).encode()
+            other.writestr(name, content)
+    with pytest.raises(InputError, match=word):
+        read_splats(tmp_path / "b.sog")
 
 
 @pytest.mark.parametrize("degree", [0, 3])
