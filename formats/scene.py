@@ -1,5 +1,5 @@
-"""`scene/4`: the exported scene: PLY and SPZ for viewers, ragged arrays for us, a label dictionary and a
-summary.
+"""`scene/4`: the exported scene: PLY and SPZ for viewers, ragged arrays for us, a label dictionary
+and a summary.
 """
 
 from __future__ import annotations
@@ -154,8 +154,8 @@ class Scene:
 
 @dataclass
 class RaggedScene(Record):
-    """`Scene` as stored: a Gaussian pays only for the SH bands that it keeps, and two bytes for what
-    it means.
+    """`Scene` as stored: a Gaussian pays only for the SH bands that it keeps, and two bytes for
+    what it means.
 
     All but `degrees` are in order of degree. sh1, sh2, sh3: rows of the Gaussians that keep the
       band. features: a dictionary in fixed point, of which `meanings` are rows; steps: what an

@@ -1,4 +1,6 @@
-"""PlayCanvas' SOG, version 2: a zip of lossless WebP pictures, a pixel a Gaussian, and meta.json."""
+"""PlayCanvas' SOG, version 2: a zip of lossless WebP pictures, a pixel a Gaussian, and
+meta.json.
+"""
 
 from __future__ import annotations
 

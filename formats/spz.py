@@ -29,8 +29,7 @@ HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # and how many streams there are, and
 SIZES = struct.Struct("<QQ")  # of a stream: compressed, plain
 # these change their sign with y and z, of the 15 coefficients beyond band 0
 TURNED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-# What bytes tell apart, where the format leaves that to the writer; each keeps the picture of
-# office0 within 0.1 dB or saves more than that costs (docs/usage.md)
+# What bytes tell apart, where the format leaves that to the writer; docs/usage.md has figures
 FINE = 3.0  # steps of a coordinate in the median Gaussian's thickness, at least
 ROTATION_STEP = 8  # of 511, in which an entry of a quaternion reaches 1/√2
 LIGHT_STEP = 4  # of 128, in which a coefficient reaches 1

@@ -1,5 +1,5 @@
-"""A dictionary of a scene's meanings: few features that many Gaussians share, so that each needs two
-bytes to say which.
+"""A dictionary of a scene's meanings: few features that many Gaussians share, so that each needs
+two bytes to say which.
 """
 
 from __future__ import annotations

@@ -70,9 +70,7 @@ def exported(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def converted(exported, packages):
-    """The exported folder with a compressed PLY in it, as docs/usage.md has it, and SOG of ours beside
-    its SPZ.
-    """
+    """The exported folder with a compressed PLY in it, as docs/usage.md has it, and SOG of ours."""
     transform(packages, exported[0] / "scene.ply", exported[0] / "scene.compressed.ply")
     write_splats(exported[0] / "scene.sog", exported[1])
     return exported[0]
