@@ -5,4 +5,5 @@ Tables, CSV files and figures go to build/bench. Each module ends with `main(arg
 returns the exit code.
 """
 
-import chebsplat  # noqa: F401  # before torch: a busy machine punishes OpenMP threads that wait actively
+# before torch: a busy machine punishes OpenMP threads that wait actively
+import chebsplat  # noqa: F401

@@ -1,5 +1,4 @@
-"""Run a benchmark, after the stages of the scene that it measures on: python -m benchmarks NAME
-[ARGUMENTS].
+"""Run a benchmark, after the stages of its scene: python -m benchmarks NAME [ARGUMENTS].
 
 With --work FOLDER among the arguments, a folder of a scene's links, that scene is measured as it
 is.
@@ -20,9 +19,7 @@ SCENE = "office0"
 
 @dataclass(frozen=True)
 class Benchmark:
-    """module: in `benchmarks`; stages: what it needs of SCENE, under `settings` (as `set=` takes
-    them).
-    """
+    """module: in `benchmarks`; stages of SCENE that it needs, under `settings` as in `set=`."""
 
     module: str
     measures: str
@@ -87,9 +84,7 @@ BENCHMARKS = {
 
 
 def linked(benchmark: Benchmark) -> Path:
-    """The folder of SCENE's links, its `stages` brought up to date. Raises CalledProcessError if
-    one fails.
-    """
+    """The folder of SCENE's links, its `stages` up to date. CalledProcessError if one fails."""
     command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", "run", "--scene", SCENE]
     command += ["--set", benchmark.settings] if benchmark.settings else []
     for stage in benchmark.stages:

@@ -1,5 +1,4 @@
-"""How fast the CPU rasterizer is: ratios beside their bars, whole steps and the kernel's stages in
-milliseconds.
+"""Speed of the CPU rasterizer: ratios beside their bars, steps and kernels in milliseconds.
 
 A step is forward, L1 and backward. Variants take turns, round by round, and the fastest round of
 each counts: other load on the machine only ever adds.
@@ -70,9 +69,7 @@ def step(backend: str, n: int = N, channels: int = CHANNELS) -> Action:
 
 
 def training_step(features: int, *, by_cell: bool) -> Action:
-    """A training's step: three colours and `features` of a teacher at a quarter of the size, both
-    losses.
-    """
+    """A training's step: three colours, `features` at a quarter of the size, both losses."""
     arguments, (width, height) = scene(N, 3 + features), SIZE
     color, target = torch.rand(height, width, 3), torch.rand(height // 4, width // 4, features)
 
@@ -120,22 +117,22 @@ def stages() -> dict[str, Action]:
             means2d, covariances, depths, radii, *by_channel, width, height
         )
 
-    found = bins()
+    binned = bins()
 
     def pack() -> np.ndarray:
-        return tiles.pack(found.order, means2d, whitening, *by_channel)
+        return tiles.pack(binned.order, means2d, whitening, *by_channel)
 
     splats = pack()
 
     def forward() -> tuple[np.ndarray, ...]:
         return tiles.forward(
-            splats, found.tile_starts, found.rank, CHANNELS, 0, width, height, ceiling
+            splats, binned.tile_starts, binned.rank, CHANNELS, 0, width, height, ceiling
         )
 
-    _, _, _, *seen = forward()
+    _, _, _, *masks_and_used = forward()
 
     def backward() -> tuple[Any, ...]:
-        return tiles_adjoint.backward(N, splats, *found, *seen, ceiling, *grad, False)
+        return tiles_adjoint.backward(N, splats, *binned, *masks_and_used, ceiling, *grad, False)
 
     to_means2d, moments, *_ = backward()
     return {
@@ -152,8 +149,7 @@ def stages() -> dict[str, Action]:
 
 def take_turns(variants: dict[str, tuple[int, Action]], rounds: int) -> dict[str, float]:
     """Milliseconds of the fastest of `rounds` by name; variants are (threads, action). Each turn
-    begins with a run that
-    does not count: it fills the caches, and starts as many threads.
+    begins with a run that does not count: it fills the caches, and starts as many threads.
     """
     best = dict.fromkeys(variants, np.inf)
     for _ in range(rounds):
@@ -170,8 +166,13 @@ def take_turns(variants: dict[str, tuple[int, Action]], rounds: int) -> dict[str
 def main(arguments: Sequence[str]) -> int:
     parser = shared.parser("raster", __doc__)
     parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--yardstick", default=os.environ.get("YARDSTICK"), type=Path, metavar="FOLDER",
-                        help="of yardstick.py, to run beside ours (default: $YARDSTICK)")  # fmt: skip
+    parser.add_argument(
+        "--yardstick",
+        default=os.environ.get("YARDSTICK"),
+        type=Path,
+        metavar="FOLDER",
+        help="of yardstick.py, to run beside ours (default: $YARDSTICK)",
+    )
     options = parser.parse_args(arguments)
     if options.yardstick:
         for n in (1, 2):
@@ -200,7 +201,7 @@ def main(arguments: Sequence[str]) -> int:
         variants["cuda"] = (4, step("cuda"))
     times = take_turns(variants, options.rounds)
     base, colors = times["cpu, 4 threads"], times["training step, 3 colors"]
-    bars: list[tuple[str, float, str, float]] = [
+    bars: list[shared.Bar] = [
         ("torch over cpu, four threads", times["torch, 4 threads"] / base, ">=", 20),
         ("19 channels over 3", base / times["cpu, 3 channels"], "<=", 2.0),
         ("100k Gaussians over 20k", times["cpu, 100k"] / base, "<=", 1.9),
@@ -224,12 +225,9 @@ def main(arguments: Sequence[str]) -> int:
     for name, ms in times.items():
         print(f"  {name:<36} {ms:9.2f} ms")
         rows.append({"what": name, "value": ms, "unit": "ms"})
-    missed = 0
-    for what, value, relation, bar in bars:
-        within = value >= bar if relation == ">=" else value <= bar
-        missed += not within
-        print(f"  {what:<36} {value:9.3g}   {relation} {bar:<7g} {'' if within else 'MISSED'}")
+    met = shared.judged(bars)
+    for (what, value, relation, bar), within in zip(bars, met, strict=True):
         bounds = {"bar": f"{relation} {bar:g}", "within": within}
         rows.append({"what": what, "value": value, "unit": "ratio", **bounds})
     shared.write_csv(options.out / "rasterize.csv", rows)
-    return int(missed > 0)
+    return int(not all(met))

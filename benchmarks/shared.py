@@ -1,6 +1,4 @@
-"""What the benchmarks share: their arguments, rows as CSV, and the machine that they are measured
-on.
-"""
+"""Shared by all benchmarks: arguments, rows as CSV, and the machine that they are measured on."""
 
 from __future__ import annotations
 
@@ -22,11 +20,11 @@ from chebsplat.pipelines.running.run import execute
 from chebsplat.pipelines.work.scenes import data_of
 from chebsplat.stages.runtime.machine import cores, load, processor
 
+Bar = tuple[str, float, str, float]  # what, value, ">=" or "<=", bar
+
 
 def parser(name: str, description: str | None, work: bool = False) -> ArgumentParser:
-    """The arguments of benchmark `name`: --out, and --work where it measures on a scene; it adds
-    its own.
-    """
+    """The arguments of benchmark `name`: --out, --work for one on a scene; it adds its own."""
     prog = f"python -m benchmarks {name}"
     arguments = ArgumentParser(
         prog, description=description, formatter_class=RawDescriptionHelpFormatter
@@ -50,25 +48,33 @@ def write_csv(path: Path, rows: Sequence[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
+def judged(bars: Sequence[Bar]) -> list[bool]:
+    """Print values beside their bars, and return which are met; nan, not measured, meets none."""
+    met = [value >= bar if relation == ">=" else value <= bar for _, value, relation, bar in bars]
+    for (what, value, relation, bar), within in zip(bars, met, strict=True):
+        print(f"  {what:<36} {value:9.3g}   {relation} {bar:<7g} {'' if within else 'MISSED'}")
+    return [bool(within) for within in met]
+
+
 def there(scenes: Sequence[str]) -> list[str]:
     """The scenes whose data is there; a line for each of the others."""
-    kept = []
+    available = []
     for scene in scenes:
         if (needed := data_of(scene)) and not needed[1].is_dir():
             print(f"{scene} is left out: {needed[1]} is not there ({needed[0]})")
         else:
-            kept.append(scene)
-    return kept
+            available.append(scene)
+    return available
 
 
-def finished(wanted: Iterable[tuple[str, str]], stage: str) -> list[Plan]:
+def finished(runs: Iterable[tuple[str, str]], stage: str) -> list[Plan]:
     """Plans of (scene, settings as `set=` takes them), run up to a stage, without a path for each
     on stdout.
 
     Raises SystemExit with the run's exit code if a step fails.
     """
     planner = Planner(running=True)
-    plans = [planner.plan(scene, settings) for scene, settings in wanted]
+    plans = [planner.plan(scene, settings) for scene, settings in runs]
     planner.save()
     with redirect_stdout(StringIO()):
         code = execute(plans, stage, os.cpu_count() or 1)
@@ -78,19 +84,16 @@ def finished(wanted: Iterable[tuple[str, str]], stage: str) -> list[Plan]:
 
 
 def machine() -> str:
-    """What figures are measured with: versions, threads, processor, load."""
+    """Circumstances of figures: versions, threads, processor, load."""
     return (
         f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on "
-        f"{torch.get_num_threads()} threads, "
-        f"numba {numba.__version__} on {numba.get_num_threads()}; {processor()}, {cores()} cores, "
-        f"load {load():.1f}"
+        f"{torch.get_num_threads()} threads, numba {numba.__version__} on "
+        f"{numba.get_num_threads()}; {processor()}, {cores()} cores, load {load():.1f}"
     )
 
 
 def peak_memory() -> int:
-    """Bytes that were resident in this process at most; `ru_maxrss` is at least that of whoever
-    started it.
-    """
+    """Peak of this process's resident bytes; `ru_maxrss` counts that of its parent, too."""
     status = Path("/proc/self/status").read_text()
     return (
         int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1])

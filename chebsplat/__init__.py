@@ -1,4 +1,11 @@
-"""Semantic 3D Gaussian Splatting that understands shape."""
+"""Semantic 3D Gaussian Splatting that understands shape.
+
+load       Open a finished scene: render it, ask it in words, take a part of it.
+train      Bring a scene up to date from photos to report, and open it.
+run_stage  Run one stage in this process and publish its artifact.
+
+Errors are those of `chebsplat.errors`; docs/python.md shows all three in use.
+"""
 
 import os
 from importlib import import_module
@@ -20,17 +27,15 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 __version__ = "0.2.0"
 
-API = ("load", "run_stage", "train")
+__all__ = ("load", "run_stage", "train")
 
 
 def __getattr__(name: str) -> Any:
-    """`chebsplat.load`, `train` and `run_stage`, which are imported when first asked for: most
-    commands need none.
-    """
-    if name in API:  # not an import statement: no stage depends on what the API imports
+    """`chebsplat.load`, `train` and `run_stage`, imported on first use: most commands need none."""
+    if name in __all__:  # not an import statement: no stage depends on what the API imports
         return getattr(import_module("chebsplat.pipelines.api"), name)
     raise AttributeError(f"module 'chebsplat' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *API]
+    return [*globals(), *__all__]

@@ -13,17 +13,13 @@ def centers(cam_from_world: np.ndarray) -> np.ndarray:
 
 
 def extent(cam_from_world: np.ndarray) -> float:
-    """1.1 times the largest distance of a camera from their mean, scene units: 3DGS's scale of the
-    learning rate.
-    """
+    """1.1 times the largest distance of a camera from their mean, scene units, as in 3DGS."""
     where = centers(cam_from_world)
     return float(1.1 * np.linalg.norm(where - where.mean(0), axis=1).max(initial=0.0)) or 1.0
 
 
 def resized(K: np.ndarray, factor_x: float, factor_y: float) -> np.ndarray:
-    """Intrinsics [..., 3, 3] after the image is resized; with half-integer pixel centres every
-    entry just scales.
-    """
+    """Intrinsics [..., 3, 3] of a resized image: with half-integer pixel centres entries scale."""
     scaled: np.ndarray = K * np.array([[factor_x], [factor_y], [1.0]])
     return scaled
 
@@ -52,8 +48,8 @@ def common_up(cam_from_world: np.ndarray) -> tuple[np.ndarray, float]:
 
     Choices: the direction that the cameras' horizontal axes span least; its sign from where their
       tops point. The confidence is 1 less the ratio of the two least spreads of these axes: 0 where
-      all cameras look the same way, whose pitch cannot be told, or where they are rolled at random;
-      times the mean cosine of their tops with it.
+      all cameras look the same way, whose pitch is undetermined, or where they are rolled at
+      random; times the mean cosine of their tops with it.
     """
     rights, tops = cam_from_world[:, 0, :3], -cam_from_world[:, 1, :3]
     spreads, axes = np.linalg.eigh(rights.T @ rights)

@@ -14,9 +14,7 @@ class ConfigError(ChebsplatError):
 
 
 class InputError(ChebsplatError):
-    """An input that is missing, damaged or of a wrong schema; the message names the file and the
-    remedy.
-    """
+    """An input that is missing, damaged or of a wrong schema; the message names file and remedy."""
 
     exit_code = 3
 
@@ -34,9 +32,7 @@ class DiskFailure(ChebsplatError):
 
 
 class Stopped(BaseException):
-    """The process was asked to end; like KeyboardInterrupt, no `except Exception` takes it for a
-    failure.
-    """
+    """The process was asked to end; no `except Exception` takes it for a failure."""
 
     def __init__(self, number: int, reason: str):
         super().__init__(reason)

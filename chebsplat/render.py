@@ -1,5 +1,4 @@
-"""Rendering of a finished scene: colour by SH degree, so that a Gaussian costs only the bands it
-keeps.
+"""Rendering of a finished scene, in which a Gaussian costs only the SH bands that it keeps.
 
 `frame_parts` takes the steps of `SceneRenderer.render` on the CPU one by one under a clock.
 """
@@ -27,8 +26,7 @@ NEAR, FAR, BLUR, MAX_ALPHA = 0.01, 1e10, 0.3, 0.99  # the defaults of `rasterize
 
 
 def colors_by_degree(sh0: Tensor, shN: Tensor, directions: Tensor, degrees: Tensor) -> Tensor:
-    """Colours [N, 3] of Gaussians sorted by ascending degree; each bucket evaluates its own bands
-    only.
+    """Colours [N, 3] of Gaussians sorted by ascending degree, each bucket by its own bands only.
 
     Raises: ValueError if `degrees` [N] does not ascend.
     Choices: on a GPU all bands of all, those above a degree being zero: a bucket costs more there
@@ -54,13 +52,11 @@ def focals(Ks: Tensor | np.ndarray) -> np.ndarray:
 
 
 class SceneRenderer:
-    """Renders an exported scene (`formats.scene.Scene.parameters`) on a device; its depth, always
-    on the CPU.
+    """Renders an exported scene (`formats.scene.Scene.parameters`); its depth always on the CPU.
 
     Ks: [V, 3, 3] of the cameras that the scene was trained on. A view that is finer than all of
-      them is
-    blurred as much as theirs were, since what was trained under their blur is too thin without;
-    None: every view has the rasterizer's own blur.
+      them is blurred as much as theirs were, since what was trained under their blur is too thin
+      without; None: every view has the rasterizer's own blur.
     """
 
     def __init__(
@@ -111,7 +107,7 @@ class SceneRenderer:
         )
         camera = (view.viewmat[None], view.K[None], view.width, view.height)
         options: dict[str, Any] = {"eps2d": BLUR * finer**2}
-        if self.on_gpu:  # what the other backends do not know
+        if self.on_gpu:  # an option of this backend alone
             options["harmless"] = True
         render, _, _ = rasterize(*gaussians, channels, *camera, **options)
         image = (render[0, ..., :3].clamp(0, 1) * 255).round().byte().cpu().numpy()
@@ -129,8 +125,8 @@ class SceneRenderer:
         """
         index = in_frustum(self.means, view.to(self.means.device), self.reach).cpu()
         K, pose = view.K.double().cpu(), view.viewmat.double().cpu()
-        held = (self.means, self.quats, self.scales, self.opacities)
-        gaussians = tuple(part.cpu()[index] for part in held)
+        parts = (self.means, self.quats, self.scales, self.opacities)
+        gaussians = tuple(part.cpu()[index] for part in parts)
         means, normals = (
             values.double() @ pose[:3, :3].T for values in (gaussians[0], self.normals[index])
         )

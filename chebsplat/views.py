@@ -1,6 +1,4 @@
-"""Views: one camera at one resolution, what lies in its frustum, and the photos a training looks
-at.
-"""
+"""Views: one camera at one resolution, what lies in its frustum, the photos of a training."""
 
 from __future__ import annotations
 
@@ -34,9 +32,7 @@ def in_frustum(means: Tensor, view: View, reach: Tensor) -> Tensor:
 
 
 def may_be_seen(means: Tensor, view: View, reach: Tensor, margin: float = 0.15) -> Tensor:
-    """Whether points' spheres of radius `reach` [N] may touch the image, bool [N]; those of NaN
-    never do.
-    """
+    """True for points whose spheres of radius `reach` [N] may touch the image, [N]; not for NaN."""
     camera = means @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
     x, y, z = camera.unbind(-1)
     half_x, half_y = 0.5 * view.width * (1 + margin), 0.5 * view.height * (1 + margin)
@@ -57,16 +53,16 @@ def remembered(read: Callable[[Any], Tensor], budget: int) -> Callable[[Any], Te
     Choices: what came first stays. Views are visited in random order, once a round: to drop the
       least recently used for another would lose it before it is needed again.
     """
-    kept: dict[Hashable, Tensor] = {}
+    cached: dict[Hashable, Tensor] = {}
     left = budget
 
     def recall(index: Hashable) -> Tensor:
         nonlocal left
-        if index in kept:
-            return kept[index]
+        if index in cached:
+            return cached[index]
         value = read(index)
         if value.nbytes <= left:
-            kept[index] = value
+            cached[index] = value
             left -= value.nbytes
         return value
 
@@ -74,8 +70,8 @@ def remembered(read: Callable[[Any], Tensor], budget: int) -> Callable[[Any], Te
 
 
 class Stored:
-    """Arrays [V, ...] of views, indexed as a tensor would be, that are read when their view is
-    looked at: `read(view)` is a tensor, and what fits into `budget` bytes stays in memory.
+    """Arrays [V, ...] of views, indexed as a tensor would be and read on access: `read(view)` is a
+    tensor, and what fits into `budget` bytes stays in memory.
     """
 
     def __init__(self, read: Callable[[int], Tensor], count: int, budget: int):
@@ -91,9 +87,7 @@ class Stored:
 
 
 def stacked(read: Callable[[int], Tensor], count: int, budget: int) -> Tensor | Stored:
-    """Arrays [V, ...] of views in memory where they fit into `budget` bytes, otherwise as they are
-    looked at.
-    """
+    """Arrays [V, ...] of views, in memory if they fit into `budget` bytes, else read when used."""
     first = read(0)
     if count * first.nbytes > budget:
         return Stored(read, count, budget)
@@ -101,9 +95,8 @@ def stacked(read: Callable[[int], Tensor], count: int, budget: int) -> Tensor | 
 
 
 class TaughtLabels(NamedTuple):
-    """What a teacher takes a view's cells for: classes i64 [h, w], -1 where it says nothing;
-    confidence [h, w] in [0, 1]; class_codes [L, C] that features of a label are near; complete:
-    whether every cell has a label.
+    """A teacher's labels of a view's cells: classes i64 [h, w], -1 none; confidence [h, w] in [0,
+    1]; class_codes [L, C] that features of a label are near; complete: every cell has a label.
     """
 
     classes: Tensor
@@ -129,8 +122,8 @@ class Window(NamedTuple):
 class Views:
     """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None, both as tensors or
     stored; features: view index -> [h, w, C]; labels: view index -> `TaughtLabels` of these h × w
-    cells, None where the teacher has none;
-    depth: view index and factor -> z-depths [H, W] at 1/factor, scene units, nan where unknown.
+    cells, None where the teacher has none; depth: view index and factor -> z-depths [H, W] at
+    1/factor, scene units, nan where unknown.
     """
 
     names: list[str]
@@ -141,7 +134,7 @@ class Views:
     features: Callable[[int], Tensor] | None = None
     labels: Callable[[int], TaughtLabels] | None = None
     depth: Callable[[int, int], Tensor] | None = None
-    scaled_Ks: dict[int, Tensor] = field(default_factory=dict)  # by factor, once asked for
+    scaled_Ks: dict[int, Tensor] = field(default_factory=dict)  # by factor, on first use
 
     def to(self, device: str | torch.device) -> Views:
         """The same views on a device: photos, masks and cameras for good, labels for each step
@@ -196,9 +189,7 @@ class Views:
         return self.scaled_Ks[factor]
 
     def photo(self, index: int, window: Window | None = None) -> tuple[Tensor, Tensor | None]:
-        """The photo u8 [H, W, 3] of a view, or a window of it, and its mask bool [H, W]; None: all
-        pixels count.
-        """
+        """The photo u8 [H, W, 3] of a view or window, and its mask bool [H, W]; None: all count."""
         image, mask = self.images[index], None if self.masks is None else self.masks[index]
         if window is None:
             return image, mask
@@ -206,8 +197,8 @@ class Views:
 
 
 def reduced(photo: Tensor, mask: Tensor | None, factor: int) -> tuple[Tensor, Tensor | None]:
-    """Colours [H, W, 3] in [0, 1] and mask [H, W] of a photo u8 at 1/factor; a pixel counts if all
-    of it does.
+    """Colours [H, W, 3] in [0, 1] and mask [H, W] of a photo u8 at 1/factor; a reduced pixel counts
+    where all of its pixels do.
     """
     image = photo.float() / 255
     if factor > 1:

@@ -1,8 +1,7 @@
 """Artifacts on disk: published whole or not at all, described by a manifest, verified on reading.
 
 An artifact is a directory holding `artifact.json` and the files it lists. `publish` writes into a
-hidden
-sibling, puts the manifest last, and renames: a reader sees a finished artifact or none.
+hidden sibling, puts the manifest last, and renames: a reader sees a finished artifact or none.
 """
 
 from __future__ import annotations
@@ -31,13 +30,14 @@ def sha256_file(path: Path) -> str:
 
 
 def is_published(path: Path) -> bool:
-    """Whether a folder holds a manifest: `publish` has ended there."""
+    """True where a folder holds a manifest: `publish` has ended there."""
     return os.path.isfile(path / MANIFEST)
 
 
 def copy(path: Path, out: Path, manifest: Manifest) -> None:
-    """Publish the artifact `path`, whose manifest was read, at `out` as well. Raises InputError if
-    it has changed.
+    """Publish the artifact `path`, whose manifest was read, at `out` as well.
+
+    Raises: InputError if it has changed.
     """
     expected = manifest.files
     with publish(out, manifest) as tmp:
@@ -63,10 +63,10 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
     """Yield a scratch directory that becomes `out`, whole, when the block ends without an error.
 
     `manifest` may be completed inside the block (facts, seconds); its file table is filled in here.
-    A whole artifact that stands there, such as a twin's that was faster, is kept and ours is
-    discarded, unless `force` asks for ours. Until the block has ended, what stands at `out` stays.
-    Raises: InputError as `check_place`; ConfigError if there can be no `out`; DiskFailure if the
-      disk takes no more.
+    A whole artifact at `out`, as of another run that was faster, stays and ours is discarded,
+    unless `force` is set. Nothing at `out` is touched before the end of the block.
+    Raises: InputError as `check_place`; ConfigError if `out` cannot be made; DiskFailure if the
+      disk is full.
     """
     out = Path(out)
     tmp = out.parent / f".tmp-{out.name}-{os.getpid()}"
@@ -75,7 +75,7 @@ def publish(out: Path, manifest: Manifest, force: bool = False) -> Iterator[Path
             _make(tmp, out)
             yield tmp
             if force or not is_whole(out, manifest.schema):
-                manifest.files = _settled(tmp)
+                manifest.files = _settle(tmp)
                 (tmp / MANIFEST).write_text(
                     json.dumps(asdict(manifest), indent=1, sort_keys=True) + "\n"
                 )
@@ -101,15 +101,13 @@ def _make(tmp: Path, out: Path) -> None:
 
 
 def _put(tmp: Path, out: Path, manifest: Manifest, force: bool) -> None:
-    """Rename `tmp` to `out`; what `check_place` lets be replaced is renamed before: no one sees
-    half of either.
-    """
+    """Rename `tmp` to `out`, and before it away what `check_place` lets it replace."""
     replaced = tmp.with_name(f".tmp-{out.name}-old-{os.getpid()}")
     try:
         os.rename(tmp, out)
     except OSError:
         if not force and is_whole(out, manifest.schema):
-            return  # a twin was faster
+            return  # another run was faster
         check_place(out, manifest.schema, manifest.key, force)
         os.rename(out, replaced)
         try:
@@ -122,13 +120,11 @@ def _put(tmp: Path, out: Path, manifest: Manifest, force: bool) -> None:
 
 
 def check_place(out: Path, schema: str, key: str, force: bool = False) -> None:
-    """Whether a stage may put its artifact at `out`, where nothing whole of it stands, or where
-    `force` replaces it.
+    """Refuse `out` for an artifact unless nothing whole stands there, or `force` may replace it.
 
-    Choices: a folder that bears the artifact's key is its own, whatever a crash has left of it.
-      Elsewhere only an artifact of the same schema goes, by `force`, and with nothing beside what
-      its manifest lists.
-    Raises: InputError saying what stands there; nothing is removed.
+    Choices: a folder named by the artifact's key may be replaced, whatever a crash left in it.
+      Elsewhere only an artifact of the same schema may, by `force`, and without unlisted files.
+    Raises: InputError naming the obstacle; nothing is removed.
     """
     if os.path.islink(out):
         raise InputError(
@@ -145,7 +141,7 @@ def check_place(out: Path, schema: str, key: str, force: bool = False) -> None:
         )
     try:
         standing = parse_manifest(out)
-    except InputError:  # it may be anyone's: nobody is told to delete it
+    except InputError:  # it may be the user's: no advice to delete it
         raise InputError(
             f"{out / MANIFEST} is no manifest: nothing was replaced; choose another --out"
         ) from None
@@ -236,7 +232,7 @@ def _entry(path: Path) -> dict[str, Any]:
     return {"sha256": sha256_file(path), "bytes": path.stat().st_size}
 
 
-def _settled(root: Path) -> dict[str, dict[str, Any]]:
+def _settle(root: Path) -> dict[str, dict[str, Any]]:
     """Make files outlive a power cut, and as readable as the user's umask has made their folder
     (some writers give a file to its owner alone); returns their sizes and digests by name.
 
@@ -260,9 +256,7 @@ def digest(value: Mapping[str, Any]) -> str:
 
 
 def discard(scratch: Path) -> None:
-    """Remove a scratch directory. Raises ValueError if it is none: nothing of the user's is ever
-    removed.
-    """
+    """Remove a scratch directory. Raises ValueError if it is none, so that no user's file goes."""
     if not scratch.name.startswith((".part-", ".tmp-")):
         raise ValueError(f"{scratch} is no scratch directory")
     if scratch.exists():
@@ -270,9 +264,7 @@ def discard(scratch: Path) -> None:
 
 
 def write_document(path: Path, value: Any) -> None:
-    """Write `value` as JSON. Raises ValueError on a value JSON or UTF-8 does not have, nan among
-    them.
-    """
+    """Write `value` as JSON. Raises ValueError on nan, and on what UTF-8 cannot hold."""
     path.write_text(
         json.dumps(value, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )

@@ -1,6 +1,4 @@
-"""`NAME.relevancy.json` beside a teacher's `NAME.onnx`: what its relevancy means, and the rooms
-that say so.
-"""
+"""`NAME.relevancy.json` beside a teacher's `NAME.onnx`: the calibration of its relevancy."""
 
 from __future__ import annotations
 
@@ -47,7 +45,7 @@ class TeacherCalibration:
 
 
 def beside(model: Path) -> Path:
-    """Where the calibration of a teacher's .onnx lies."""
+    """Path of the calibration of a teacher's .onnx."""
     return model.with_suffix(".relevancy.json")
 
 
@@ -58,21 +56,21 @@ def write_calibration(path: Path, of: TeacherCalibration) -> None:
 
 
 def calibration_of(model: Path) -> TeacherCalibration | None:
-    """What lies beside a teacher's .onnx, or beside the embedded teacher where that is the same
-    file elsewhere.
+    """The calibration of a teacher's .onnx, also where that is a copy of the embedded one's.
 
     Raises: as `read_calibration`.
     """
-    found = read_calibration(model)
-    same = found is None and model != EMBEDDED and model_sha256(model) == model_sha256(EMBEDDED)
-    return read_calibration(EMBEDDED) if same else found
+    calibration = read_calibration(model)
+    same = (
+        calibration is None and model != EMBEDDED and model_sha256(model) == model_sha256(EMBEDDED)
+    )
+    return read_calibration(EMBEDDED) if same else calibration
 
 
 def read_calibration(model: Path) -> TeacherCalibration | None:
-    """That of a teacher's .onnx; None where there is none.
+    """The calibration beside a teacher's .onnx; None where there is none.
 
-    Raises: InputError naming the file where it is damaged, or of another model than the one beside
-      it.
+    Raises: InputError naming the file where it is damaged, or belongs to another model.
     """
     path = beside(model)
     if not path.is_file():
@@ -86,12 +84,12 @@ def read_calibration(model: Path) -> TeacherCalibration | None:
         raise InputError(f"{path}: {field}: {first['msg']}; {REMEDY}") from None
     if document.pop("schema") != SCHEMA:
         raise InputError(f"{path} is not of {SCHEMA}; {REMEDY}")
-    found = TeacherCalibration(**document)
-    if sorted(found.calibration) != sorted(COEFFICIENTS):
+    record = TeacherCalibration(**document)
+    if sorted(record.calibration) != sorted(COEFFICIENTS):
         raise InputError(f"{path}: calibration: {', '.join(COEFFICIENTS)} are needed; {REMEDY}")
-    if not found.rivals:
+    if not record.rivals:
         raise InputError(f"{path}: rivals: at least one word is needed; {REMEDY}")
-    check_names(found.rivals, "rivals", path, REMEDY)
-    if found.sha256 != model_sha256(model):
+    check_names(record.rivals, "rivals", path, REMEDY)
+    if record.sha256 != model_sha256(model):
         raise InputError(f"{path} is of another model than {model.name}; {REMEDY}")
-    return found
+    return record

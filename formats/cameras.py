@@ -15,9 +15,7 @@ RIGID = 1e-3  # largest entry of |RRᵀ − I|
 
 @dataclass
 class Cameras(Record):
-    """names of V views; Ks f64 [V, 3, 3] pixels of a width x height image; cam_from_world f64 [V,
-    4, 4].
-    """
+    """names of V views; Ks f64 [V, 3, 3] pixels, cam_from_world [V, 4, 4]; size of the images."""
 
     names: list[str]
     Ks: Annotated[np.ndarray, Array("float64", ("view", 3, 3), "pixels")]
@@ -29,9 +27,7 @@ class Cameras(Record):
 def check_cameras(
     names: list[str], Ks: np.ndarray, poses: np.ndarray | None, where: object, remedy: str
 ) -> None:
-    """Raise InputError naming the first view whose camera cannot be used; poses [V, 4, 4] of a
-    world, or None.
-    """
+    """Raise InputError naming the first view whose camera is unusable; poses [V, 4, 4], or None."""
     for what, data in (("Ks", Ks), ("poses", poses)):
         if data is not None and len(data) != len(names):
             raise InputError(f"{where}: {len(data)} {what} for {len(names)} views; {remedy}")

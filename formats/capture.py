@@ -1,6 +1,4 @@
-"""`capture/2`: what was photographed. Images and cameras; depth, labels and loss masks where the
-source has them.
-"""
+"""`capture/2`: images and cameras; depth, labels and loss masks where the source has them."""
 
 from __future__ import annotations
 
@@ -30,13 +28,11 @@ class Capture(Record):
     is_test:        bool [V]; test views are never trained on.
     depth, labels, pseudo_labels, confidence, loss_mask: of each pixel, or None. class_names[labels]
       names a pixel.
-    points:         f32 [N, 3] in the world, where the source has its own, with point_colors u8 [N,
-      3] or None, and
-                    tracks i32 [T, 2] (point, view), who sees them, or None.
-    taken:          u8 [T, H', W', 3], test photos that are undistorted or reduced, as they were
-      taken, to 1600
-                    pixels, or None; lenses: of each the view's name, COLMAP's model and parameters,
-                    width and height.
+    points:         f32 [N, 3] in the world, where the source has points; point_colors u8 [N, 3] and
+      tracks i32 [T, 2] (point, view that observes it), or None.
+    taken:          u8 [T, H', W', 3], originals (at most 1600 pixels) of test photos that `images`
+      has undistorted or reduced, or None; lenses: of each the view's name, COLMAP's model and
+      parameters, width and height.
     source:         which source, and notes about what was dropped or changed; protocol: name and
       parameters.
     """
@@ -83,9 +79,7 @@ class Capture(Record):
         return self.images.shape[2], self.images.shape[1]
 
     def write(self, out: Path) -> None:
-        """Fill the directory that `artifact.publish` yields. Raises InputError if the views do not
-        fit together.
-        """
+        """Fill the directory of `artifact.publish`. Raises InputError where views disagree."""
         _check(self)
         super().write(out)
 

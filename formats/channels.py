@@ -1,6 +1,4 @@
-"""`channels/2`: the linear map from a teacher's channels to the fewer that scenes are trained
-in.
-"""
+"""`channels/2`: the linear map from a teacher's channels to the fewer of a trained scene."""
 
 from __future__ import annotations
 
@@ -14,8 +12,7 @@ from chebsplat.formats.record import Array, Record
 
 @dataclass
 class ChannelMap(Record):
-    """The linear map from a teacher's C channels to d; one for all scenes, computed by
-    `chebsplat.labels.channels`.
+    """The linear map from a teacher's C channels to d, one for all scenes (`labels.channels`).
 
     matrix:  f32 [C, d] orthonormal columns, of falling weight.
     inverse: f32 [d, C], back to the teacher's channels.

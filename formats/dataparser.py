@@ -1,6 +1,4 @@
-"""nerfstudio's dataparser_transforms.json: how the cameras were moved and scaled that a splat was
-trained by.
-"""
+"""nerfstudio's dataparser_transforms.json: the similarity it applied to a splat's cameras."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.files import parse_json
 
 NAME = "dataparser_transforms.json"
-ABOVE = 3  # folders above a splat's own that are looked in
+ABOVE = 3  # parent folders of a splat that are searched
 
 
 def beside(ply: Path) -> Path | None:
@@ -22,9 +20,7 @@ def beside(ply: Path) -> Path | None:
 
 
 def read_dataparser(path: Path) -> tuple[float, np.ndarray, np.ndarray]:
-    """scale, rotation [3, 3] and shift [3]: x' = scale (rotation x + shift). Raises InputError
-    naming the file.
-    """
+    """scale, rotation [3, 3], shift [3]: x' = scale (rotation x + shift). Raises InputError."""
     document = parse_json(path)
     try:
         matrix, scale = np.array(document["transform"], float), float(document["scale"])

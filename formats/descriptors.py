@@ -1,6 +1,4 @@
-"""`descriptors/2`: points of a scene's surface, and the shape about each: what the point encoder
-sees.
-"""
+"""`descriptors/2`: points of a scene's surface and the shape about each, the encoder's input."""
 
 from __future__ import annotations
 
@@ -19,8 +17,8 @@ class Descriptors(Record):
     own, means, normals, descriptors, neighbors: as in `shape.point_inputs.PointInputs`.
     origin: [3] scene units; up: [3] against gravity, in the scene's frame; unit: scene units in a
       metre.
-    notes:  whose surface it is, how sure up is, what the unit comes from; why there is no point,
-      where there is none.
+    notes:  source of the surface, certainty of up, origin of the unit; the reason if there is no
+      point.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.descriptors/2"

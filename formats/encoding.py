@@ -14,7 +14,7 @@ from chebsplat.formats.record import Array, Record
 class Encoding(Record):
     """features: f16 [N, p] of the points of a `descriptors` artifact, in their order; the last is
     1.
-    notes: why there is no point, where there is none.
+    notes: the reason if there is no point.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.encoding/1"

@@ -1,6 +1,5 @@
-"""`evaluation/2`: figures per view and per class, rendered pictures, timings;
-`agreement/2`: how far the views of a capture agree on what the same points are, by their 2D
-  teacher.
+"""`evaluation/2`: figures per view and per class, rendered pictures, timings; `agreement/2`: share
+of points for which the views of a capture agree, by their 2D teacher.
 """
 
 from __future__ import annotations
@@ -29,9 +28,7 @@ class Evaluation:
     pictures: dict[str, Stack] = field(default_factory=dict)
 
     def write(self, out: Path) -> None:
-        """Fill the directory that `artifact.publish` yields. Raises ValueError on a figure that is
-        nan or infinite.
-        """
+        """Fill the directory of `artifact.publish`. Raises ValueError on a nan or infinity."""
         write_document(out / FIGURES, self.figures)
         Pictures(**self.pictures).write(out)
 
@@ -50,9 +47,7 @@ class Evaluation:
 
 @dataclass
 class Pictures(Record):
-    """Of the test views: `truth`, `renders` u8 [V, H, W, 3]; maps i16 [V, H, W] of labels, -1
-    none.
-    """
+    """Of the test views: `truth`, `renders` u8 [V, H, W, 3]; label maps i16 [V, H, W], -1 none."""
 
     SCHEMA: ClassVar[str] = Evaluation.SCHEMA
     truth: Annotated[Stack | None, Array("uint8", (*PIXELS, 3), "sRGB", by_view=True)] = None
@@ -69,9 +64,7 @@ def read_figures(path: Path, manifest: Manifest) -> dict[str, Any]:
 
 
 def rests(segmentation: Any, figure: str = "miou") -> str:
-    """How many classes and pixels (or points) of truth a mIoU rests on, in words; empty where it is
-    not known.
-    """
+    """Classes and pixels (or points) of truth behind a mIoU, in words; empty where not counted."""
     of = segmentation.get("counted", {}).get(figure)
     return (
         (
@@ -85,12 +78,11 @@ def rests(segmentation: Any, figure: str = "miou") -> str:
 
 @dataclass
 class ViewAgreement(Record):
-    """agreement: 1 if views always agree, 0 if by chance alone, None where no point was seen twice.
+    """agreement: 1 if views always agree, 0 if by chance alone, None without points in two views.
 
-    n_points: that two of the `n_views` training views see.
-    labels:   by name, of those that are said at all: `share` of what views say, and the `agreement`
-      of the views on
-              this label.
+    n_points: seen by at least two of the `n_views` training views.
+    labels:   by name, of those that any view gives: `share` of all votes, and `agreement` of the
+      views on this label.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.agreement/2"

@@ -1,6 +1,4 @@
-"""`features/2`: per-view semantic features of a 2D teacher, and the labels they can be asked
-for.
-"""
+"""`features/2`: per-view semantic features of a 2D teacher, and the labels they are scored by."""
 
 from __future__ import annotations
 
@@ -29,8 +27,7 @@ class Features(Record):
     names:            of the views, for joins.
     features:         f16 [V, h, w, C].
     label_names:      L names; label_embeddings: f32 [L, C], no row longer than 1; a pixel's label
-      is the one of the
-                      largest inner product. Rows are unit unless `channels` keeps a part of them.
+      is the one of the largest inner product. Rows are unit unless `channels` keeps a part of them.
     pseudo_labels:    i16 [V, h, w] or None; confidence: f16 [V, h, w] in [0, 1] or None.
     convention:       n_scales, flips, normalized and the teacher's own parameters: a loss needs to
       know them.
@@ -51,17 +48,16 @@ class Features(Record):
 
 
 class FeatureWriter:
-    """Writes one view at a time, in any order, into a folder that survives a kill; the same bytes
-    however often.
+    """Writes features view by view, in any order, into a folder that survives a kill.
 
-    A view is done once a mark says so, and the mark is written when the view's files are safe on
-    disk. Whatever a kill left of another view is written anew.
+    A marker per view is written once the view's files are synced; a view without one is written
+    again. The bytes do not depend on the order or the number of attempts.
 
     Args:
       folder:    of this writer alone, on the disk of the artifact that `finish` fills.
       names:     of the V views; shape: (h, w, C) of each.
-      made_with: what else the values depend on; a folder made with other names, shape or settings
-        starts anew.
+      made_with: further settings behind the values; a folder with other names, shape or settings is
+        emptied.
     """
 
     def __init__(
@@ -72,26 +68,26 @@ class FeatureWriter:
         made_with: Mapping[str, Any] | None = None,
     ):
         self.folder, self.names, self.shape = Path(folder), list(names), shape
-        wanted = json.dumps(
+        settings = json.dumps(
             {"names": self.names, "shape": list(shape), "made_with": dict(made_with or {})}
         )
         state = self.folder / "writer.json"
-        if not state.is_file() or state.read_text() != wanted:
+        if not state.is_file() or state.read_text() != settings:
             shutil.rmtree(self.folder, ignore_errors=True)
             (self.folder / "done").mkdir(parents=True)
-            atomic_write(state, wanted)
+            atomic_write(state, settings)
         self._arrays: dict[str, Any] = {}
-        self._holds: dict[int, list[str]] = {}  # view -> names of its arrays
-        for mark in (self.folder / "done").iterdir():
-            held = mark.read_text().split()
-            if mark.name.isdigit() and all(
-                self._file(name, int(mark.name)).is_file() for name in held
+        self._holds: dict[int, list[str]] = {}  # names of arrays by view
+        for marker in (self.folder / "done").iterdir():
+            arrays = marker.read_text().split()
+            if marker.name.isdigit() and all(
+                self._file(name, int(marker.name)).is_file() for name in arrays
             ):
-                self._holds[int(mark.name)] = held
+                self._holds[int(marker.name)] = arrays
 
     @property
-    def done(self) -> set[int]:
-        """Views that need not be added again."""
+    def finished(self) -> set[int]:
+        """Views on disk, which need not be added again."""
         return set(self._holds)
 
     def add(
@@ -105,8 +101,8 @@ class FeatureWriter:
 
         Raises: ValueError naming the view on another shape, or on a value that float16 cannot hold.
         """
-        given = {"features": features, "pseudo_labels": pseudo_labels, "confidence": confidence}
-        values = {name: value for name, value in given.items() if value is not None}
+        arrays = {"features": features, "pseudo_labels": pseudo_labels, "confidence": confidence}
+        values = {name: value for name, value in arrays.items() if value is not None}
         for name, value in values.items():
             array = self._array(name)
             if value.shape != array.shape[1:]:
@@ -133,8 +129,7 @@ class FeatureWriter:
         convention: dict[str, Any],
         channels: ChannelMap | None = None,
     ) -> Features:
-        """Fill the directory that `artifact.publish` yields, and return what it holds; the writer's
-        own folder stays as it is.
+        """Link the views into `out`, which `artifact.publish` yields; the writer's folder stays.
 
         Raises: ValueError naming a view that was not added, or was added without its labels or
           confidence.
@@ -143,17 +138,17 @@ class FeatureWriter:
         if absent:
             raise ValueError(f"view {absent[0]} was not added ({len(absent)} such)")
         stored = {}
-        for name in sorted({name for held in self._holds.values() for name in held}):
+        for name in sorted({name for arrays in self._holds.values() for name in arrays}):
             stored[name] = self._array(name)
-            for view, held in self._holds.items():
-                if name not in held:
+            for view, arrays in self._holds.items():
+                if name not in arrays:
                     raise ValueError(f"view {self.names[view]} was added without {name}")
                 file = self._file(name, view)
                 _link(file, out / file.relative_to(self.folder))
             _link(self.folder / name / METADATA, out / name / METADATA)
         check_names(label_names, "label names", "features", "correct the labels")
         fixed = (label_names, label_embeddings)
-        made = Features(
+        record = Features(
             self.names,
             stored.pop("features"),
             *fixed,
@@ -161,13 +156,11 @@ class FeatureWriter:
             convention=convention,
             channels=channels,
         )
-        made.write(out)
-        return made
+        record.write(out)
+        return record
 
     def _array(self, name: str) -> Any:
-        """The open array. Metadata are written anew, always the same; what chunks there are
-        stay.
-        """
+        """The open array. Its metadata are written anew, always the same; chunks on disk stay."""
         if name not in self._arrays:
             spec = layout_of(Features).arrays[name]
             shape = (len(self.names), *self.shape)[: len(spec.axes)]
@@ -182,9 +175,7 @@ class FeatureWriter:
 
 
 def _link(source: Path, target: Path) -> None:
-    """A second name for a file: no bytes are copied, and a kill before publication loses no
-    view.
-    """
+    """Hard-link a file: no bytes are copied, and a kill before publication loses no view."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target)

@@ -1,10 +1,8 @@
-"""Files one by one. Reading what people or other programs wrote: regular, of bounded size, UTF-8,
-and parsed or named in a clear error. Writing a file whole or not at all; a disk that is full, over
-quota or read-only said in one line.
+"""Files: others' read with checks of type, size and syntax, ours written atomically.
 
 Every reader of such a file goes through here, so that a pipe, a device, a folder, a file of
-gigabytes, bytes that are no text and a document nested a thousand levels deep are each refused at
-once, in the same words everywhere.
+gigabytes, bytes that are no text and a document nested a thousand levels deep are refused at once,
+in the same words everywhere. A disk that is full, over quota or read-only is reported in one line.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from typing import Any
 
 from chebsplat.errors import ChebsplatError, DiskFailure, InputError
 
-# bytes of text: a transforms.json of 20,000 frames; as JSON it takes up to 25 times as much memory
+# bytes of text, as a transforms.json of 20,000 frames; parsed JSON takes up to 25 times the memory
 LARGEST = 32 << 20
 LARGEST_TOML = 1 << 20  # tomllib reads about 2 MB a second
 RESTORE = "restore the file"
@@ -77,16 +75,14 @@ def parse_json(
     error: type[ChebsplatError] = InputError,
     finite: bool = False,
 ) -> Any:
-    """The value in a JSON file; `finite`: without nan or infinities, as JSON really is. Raises
-    `error`.
-    """
+    """The value in a JSON file; `finite`: nan and infinities are refused. Raises `error`."""
     text = read_text(path, remedy, error)
     try:
         strict: dict[str, Any] = (
             {"parse_constant": _finite, "parse_float": _finite} if finite else {}
         )
         value = json.loads(text, object_pairs_hook=_once, **strict)
-        # half a character: it could be printed, hashed or written nowhere
+        # a lone surrogate can be neither printed nor hashed nor written
         if SURROGATE.search(text):
             json.dumps(value, ensure_ascii=False).encode()
     except RecursionError:
@@ -97,9 +93,7 @@ def parse_json(
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object whose keys differ: of two values of one key neither is what its writer
-    meant.
-    """
+    """A JSON object of different keys: of two values of one key neither may be the intended one."""
     value = dict(pairs)
     if len(value) < len(pairs):
         twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
@@ -130,8 +124,7 @@ def parse_toml(
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path`, which a block fills; it becomes `path` when the block ends
-    without an error.
+    """A temporary path beside `path`, renamed to `path` when the block ends without an error.
 
     The file is there whole or not at all, whatever happens to the machine. A block that fails
     leaves what stood there before. The temporary name keeps the ending, by which some libraries
@@ -144,7 +137,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         sync(temporary)
         os.replace(temporary, path)
     finally:
-        with suppress(OSError):  # of the disk that has just failed
+        with suppress(OSError):  # the disk has just failed
             temporary.unlink(missing_ok=True)
     sync(path.parent)
 
@@ -166,9 +159,9 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def explained(folder: Path, scratch: bool = False) -> Iterator[None]:
-    """Turn refusals of the disk within into a DiskFailure that names the error's file, or `folder`.
+    """Turn the disk's refusals into a DiskFailure that names the error's file, or `folder`.
 
-    Args: scratch: `folder` holds what is being written and nothing else; the message has its bytes.
+    Args: scratch: `folder` only holds the files being written; the message gives their bytes.
     Raises: DiskFailure; InputError naming a file that may not be read.
     """
     try:

@@ -1,6 +1,4 @@
-"""`gaussians/2`: the checkpoint of a trained scene, all raw parameters, and the trace of its
-training.
-"""
+"""`gaussians/2`: the checkpoint of a trained scene, all raw parameters, and its training trace."""
 
 from __future__ import annotations
 
@@ -26,9 +24,8 @@ class Gaussians:
     """Raw parameters in float32; the name of each carries its transform.
 
     parameters: `means` [N,3] scene units, `log_scales` [N,3], `quats` [N,4] wxyz, `logit_opacities`
-      [N],
-                `sh0` [N,1,3], `shN` [N,15,3], `degrees` u8 [N] highest SH band kept, and, where the
-                scene has a semantic branch, `features` [N,C].
+      [N], `sh0` [N,1,3], `shN` [N,15,3], `degrees` u8 [N] highest SH band kept, and, where the
+      scene has a semantic branch, `features` [N,C].
     cameras:    of the views it was trained and may be evaluated on.
     modules:    weights of the semantic gate by dotted name; empty where they were left out.
     trace:      one row a report interval: error against run time.
@@ -43,11 +40,9 @@ class Gaussians:
     notes: dict[str, Any] = field(default_factory=dict)
 
     def write(self, out: Path) -> None:
-        """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite
-        parameter.
+        """Fill the directory that `artifact.publish` yields. Raises ValueError on nan or infinity.
 
-        Choices: SH bands that no Gaussian keeps are left out of the file; reading gives them back
-          as zeros.
+        Choices: SH bands above every Gaussian's degree are not stored; reading fills in zeros.
         """
         degrees, shN = self.parameters["degrees"], self.parameters["shN"]
         used_bands = shN[:, : (int(degrees.max(initial=0)) + 1) ** 2 - 1]
@@ -78,9 +73,9 @@ class Gaussians:
             if name != "modules"
         }
         parameters = {name: value for name, value in values.items() if value is not None}
-        n, n_kept = stored.shN.shape[:2]
+        n, n_stored = stored.shN.shape[:2]
         parameters["shN"] = np.concatenate(
-            [stored.shN, np.zeros((n, 15 - n_kept, 3), np.float32)], 1
+            [stored.shN, np.zeros((n, 15 - n_stored, 3), np.float32)], 1
         )
         ends = np.cumsum([math.prod(shape) for shape in stored.module_shapes.values()])
         parts = np.split(stored.modules, ends[:-1]) if len(ends) else []
@@ -94,8 +89,7 @@ class Gaussians:
 
 @dataclass
 class Checkpoint(Record):
-    """`Gaussians` as stored: uncompressed, since random mantissas hardly shrink, and without SH
-    bands that none keeps.
+    """`Gaussians` as stored: uncompressed, as random mantissas hardly shrink, in used SH bands.
 
     modules: f32 [W], all weights one after the other, in the order of module_shapes.
     """

@@ -1,4 +1,4 @@
-"""GLB: one primitive of triangles, or of Gaussians as glTF's KHR_gaussian_splatting has them."""
+"""GLB: one primitive of triangles, or of Gaussians by glTF's KHR_gaussian_splatting."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from chebsplat.formats.world import HERE, World
 
 KINDS = {"float32": 5126, "uint32": 5125, "uint16": 5123}
 SHAPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-VERTICES, INDICES = 34962, 34963  # what a view of the buffer is for
+VERTICES, INDICES = 34962, 34963  # targets of buffer views
 SPLAT = "KHR_gaussian_splatting"
 
 
@@ -30,8 +30,8 @@ def write_glb(
 ) -> None:
     """Write one mesh of one primitive.
 
-    Args: attributes: [V] or [V, 3 or 4] by name, f32, or u16 of [0, 1]; primitive: what it has
-      beside them; indices: u32 of triangles; names: of labels; more: members of the document.
+    Args: attributes: [V] or [V, 3 or 4] by name, f32, or u16 of [0, 1]; primitive: its
+      other members; indices: u32 of triangles; names: of labels; more: members of the document.
     """
     parts = attributes | ({} if indices is None else {"indices": indices})
     views, accessors, offset = [], [], 0
@@ -95,8 +95,8 @@ def write_splat_glb(
 ) -> None:
     """Write raw parameters (`formats.gaussians.Gaussians.parameters`); args as of `ply.write_ply`.
 
-    Choices: glTF is y up and of metres: the caller turns. Viewers that do not know the extension
-      draw points in COLOR_0. Labels are the attribute `_LABEL`, -1 for none, as of a mesh.
+    Choices: glTF is y up and in metres: the caller rotates. Viewers without the extension draw
+      points in COLOR_0. Labels are the attribute `_LABEL`, -1 for none, as in a mesh.
     """
     means = world.outward(parameters["means"]).astype(np.float32)
     unit = parameters["quats"].astype(np.float64)
@@ -117,11 +117,11 @@ def write_splat_glb(
             attributes[name] = parameters["shN"][:, k]
     if labels is not None:
         attributes["_LABEL"] = labels.astype(np.float32)
-    how = {
+    extension = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
         "sortingMethod": "cameraDistance",
         "projection": "perspective",
     }
-    primitive = {"mode": 0, "extensions": {SPLAT: how}}
+    primitive = {"mode": 0, "extensions": {SPLAT: extension}}
     write_glb(path, attributes, primitive, names=label_names, extensionsUsed=[SPLAT])

@@ -1,5 +1,4 @@
-"""Images from outside: the one door to Pillow's readers. PNG, JPEG and HEIC, recognised by content,
-of bounded size.
+"""Images from outside, read by Pillow: PNG, JPEG and HEIC, recognised by content, bounded in size.
 
 Pillow would read forty more formats, whatever a file is called; one of its readers starts
 Ghostscript.
@@ -14,43 +13,38 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.formats.extras import extra
 from chebsplat.formats.files import regular
-
-if TYPE_CHECKING:
-    import numpy as np
 
 FORMATS = ("PNG", "JPEG")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".heic", ".heif")
 # ISO/IEC 23008-12
 HEIC_BRANDS = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"}
-# of one image, and of all that are being decoded: that takes up to 12 bytes a pixel
+# of one image, and of all being decoded at once, at up to 12 bytes a pixel
 MAX_PIXELS = 64_000_000
-MAX_SIDE = 65_535  # what JPEG can hold
+MAX_SIDE = 65_535  # JPEG's limit
 INCOMPLETE = "the source is incomplete"
-# What Pillow raises on damaged pixels, and struct and its own parsers on damaged EXIF.
-DAMAGE = (OSError, SyntaxError, ValueError, struct.error, EOFError, LookupError, TypeError, AttributeError,
-          ArithmeticError)  # fmt: skip
+# Raised by Pillow on damaged pixels, and by struct and its parsers on damaged EXIF.
+DAMAGE = (OSError, SyntaxError, ValueError, struct.error, EOFError, LookupError, TypeError,
+          AttributeError, ArithmeticError)  # fmt: skip
 SUBSECTION, ORIENTATION, FOCAL_35 = 0x8769, 0x0112, 0xA405  # EXIF tags
 TURNS = {2: 0, 3: 3, 4: 1, 5: 5, 6: 4, 7: 6, 8: 2}  # orientation: Pillow's Transpose that undoes it
 ON_ITS_SIDE = (5, 6, 7, 8)  # orientations that swap width and height
 
 
 def is_image(name: str) -> bool:
-    """Whether a file's name is that of a PNG, JPEG or HEIC image; hidden files are none."""
+    """True for the name of a PNG, JPEG or HEIC image; hidden files are none."""
     return os.path.splitext(name)[1].lower() in SUFFIXES and not name.startswith(".")
 
 
 def images_below(folder: Path, remedy: str) -> list[Path]:
-    """The images of a folder and those below it, sorted. Raises InputError, which ends in the
-    remedy, without any.
-    """
+    """The images of a folder and those below it, sorted. Raises InputError where there is none."""
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not files:
         raise InputError(f"{folder} holds no .png or .jpg image; {remedy}")
@@ -58,7 +52,7 @@ def images_below(folder: Path, remedy: str) -> list[Path]:
 
 
 def is_heic(path: Path) -> bool:
-    """Whether a file is a HEIC image by its first bytes. Raises InputError if it cannot be read."""
+    """True for a HEIC image, by its first bytes. Raises InputError if it cannot be read."""
     regular(path, INCOMPLETE)
     with Path(path).open("rb") as handle:
         start = handle.read(12)
@@ -67,22 +61,14 @@ def is_heic(path: Path) -> bool:
 
 def require_heic(path: Path) -> None:
     """Raises InputError with the command that installs the reader of HEIC, if it is missing."""
-    try:
-        import_module("pillow_heif")
-    except ImportError:
-        raise InputError(
-            f"{path} is a HEIC photo, which the package pillow_heif reads: .venv/bin/pip install "
-            "-e '.[heic]' installs "
-            "it"
-        ) from None
+    extra("pillow_heif", f"{path} is a HEIC photo, which", error=InputError)
 
 
 @contextmanager
 def opened(
     path: Path, remedy: str = INCOMPLETE, check: Callable[[Any], None] | None = None
 ) -> Iterator[Any]:
-    """A decoded PIL image, for as long as a `with` block needs all of its pixels; `check` sees it
-    before it is decoded.
+    """A decoded PIL image for a `with` block; `check` is called with it before it is decoded.
 
     Choices: threads decode at once what fits into MAX_PIXELS together, and a larger photo waits for
       the others, so that blocks must not be nested.
@@ -107,9 +93,7 @@ def read_rgb(path: Path, remedy: str = INCOMPLETE) -> np.ndarray:
 
 
 def header(path: Path, remedy: str = INCOMPLETE) -> tuple[tuple[int, int], float | None]:
-    """(width, height) as the photo is meant to be seen, and its 35 mm focal length if it says so;
-    decodes no pixel.
-    """
+    """(width, height) of the upright photo, and its 35 mm focal length or None; reads no pixel."""
 
     def inspect(image: Any) -> None:
         focal = _exif(image).get_ifd(SUBSECTION).get(FOCAL_35)
@@ -136,9 +120,7 @@ def turned(image: Any) -> Any:
 
 
 def _exif(image: Any) -> Any:
-    """What precedes the pixels: for the rest of a PNG Pillow's own `getexif` would decode them
-    all.
-    """
+    """EXIF before the pixels: Pillow's own `getexif` would decode a whole PNG for the rest."""
     from PIL import Image
 
     return Image.Image.getexif(image)
@@ -163,7 +145,7 @@ def _opened(path: Path, inspect: Callable[[Any], None], remedy: str) -> Any:
     from PIL import Image, UnidentifiedImageError
 
     regular(path, remedy)
-    # Pillow's own limit lies above ours
+    # Pillow's own limit is higher than ours
     warnings.simplefilter("error", Image.DecompressionBombWarning)
     try:
         with Path(path).open("rb") as handle:

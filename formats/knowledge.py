@@ -1,6 +1,4 @@
-"""`knowledge/2`: an encoder of shape, and the map from its features to meaning that a set of
-lessons gives.
-"""
+"""`knowledge/2`: an encoder of shape, and the map from its features to meaning."""
 
 from __future__ import annotations
 
@@ -26,22 +24,19 @@ SPECS: dict[str, Spec] = {"matrix": ("float32", "C", "d"), "embeddings": ("float
 
 @dataclass
 class Knowledge:
-    """What a scene starts from.
+    """A point encoder and its linear map to meaning, from which the knowledge of a scene starts.
 
     teacher:    its name; digest: of its files, as in `channels/2`.
     encoder:    constructor settings of the point encoder; weights: its arrays by name.
-    matrix:     f32 [C, d], from the teacher's C channels to the d that answers have; columns
-      orthonormal.
-    describe:   settings of the descriptors that it sees.
-    words:      W that it can name things by; embeddings f16 [W, d] of these, unit in the teacher's
-      channels.
-    map:        f32 [p, 2 d], from features of shape to answers: d in the teacher's channels, d in
-      those of words.
-    basis:      f32 [p, r] of what was learned, in features times scale f32 [p] (Eq 15).
-    card:       how it was taught; of each kind of room held out, the shares of points named right
-                (`stages.teach.measured`) and, in `novelty`, the largest ρ′.
-    lessons:    what it was solved from, `of`: of each its key, scene, trust, why that, and whether
-                it is new in kind. Empty in what ships.
+    matrix:     f32 [C, d], from the teacher's C channels to d; columns orthonormal.
+    describe:   settings of the descriptors that the encoder reads.
+    words:      W words of the vocabulary; embeddings f16 [W, d], unit in the teacher's channels.
+    map:        f32 [p, 2 d], from features of shape to d of the teacher's channels and d of words.
+    basis:      f32 [p, r], of features times scale f32 [p]: the subspace learned so far (Eq 15).
+    card:       training facts; for each kind of room held out, the shares of points named right
+      (`stages.teach.measured`) and, in `novelty`, the largest ρ′.
+    lessons:    the lessons it was solved from, in `of`: of each its key, scene, trust, the reason,
+      and whether it is new in kind. Empty in what ships.
     shipped:    mean sums of the generated rooms, by parts of them; none in what a scene has solved.
     """
 
@@ -65,9 +60,7 @@ DOCUMENT = ("teacher", "digest", "encoder", "describe", "words", "card", "lesson
 
 
 def write_knowledge(out: Path, knowledge: Knowledge) -> None:
-    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite
-    value.
-    """
+    """Fill the directory that `artifact.publish` yields. Raises ValueError on nan or infinity."""
     write_tensors(out / "weights.safetensors", knowledge.weights)
     write_tensors(out / "answers.safetensors", {name: getattr(knowledge, name) for name in SPECS})
     for number, sums in enumerate(knowledge.shipped):

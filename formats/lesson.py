@@ -1,6 +1,4 @@
-"""`lesson/1`: what one scene teaches about shape: sums over its points, and how far they are to be
-trusted.
-"""
+"""`lesson/1`: normal-equation sums over one scene's points, and evidence for their trust."""
 
 from __future__ import annotations
 
@@ -22,10 +20,8 @@ SPECS: dict[str, Spec] = {"gram": ("float32", "half"), "cross": ("float32", "p",
 
 @dataclass
 class Lesson:
-    """sums: of the scene's points. notes: the scene's name, its teacher, points, words, ρ, σ_f, ρ′,
-    and the evidence
-    for its trust: whether its labels were given, `familiar`, and the share of labels that shape and
-      teacher have alike.
+    """sums: of the scene's points. notes: scene, teacher, points, words, ρ, σ_f, ρ′; evidence for
+    trust (labels given, `familiar`, share of labels common to shape and teacher).
     """
 
     sums: PlainSums
@@ -42,7 +38,7 @@ def packed(sums: PlainSums) -> dict[str, np.ndarray]:
 
 
 def unpacked(arrays: dict[str, np.ndarray], square: float) -> PlainSums:
-    """What `packed` made. Raises: ValueError where the sizes do not fit."""
+    """Sums from the arrays of `packed`. Raises ValueError where the sizes do not fit."""
     p = len(arrays["cross"])
     gram = np.zeros((p, p))
     gram[np.tril_indices(p)] = arrays["gram"]
@@ -50,9 +46,7 @@ def unpacked(arrays: dict[str, np.ndarray], square: float) -> PlainSums:
 
 
 def write_lesson(out: Path, lesson: Lesson) -> None:
-    """Fill the directory that `artifact.publish` yields. Raises ValueError on a non-finite
-    value.
-    """
+    """Fill the directory that `artifact.publish` yields. Raises ValueError on nan or infinity."""
     write_tensors(out / "sums.safetensors", packed(lesson.sums))
     write_document(out / "lesson.json", {"square": lesson.sums[2]} | lesson.notes)
 

@@ -1,6 +1,5 @@
 """`lifted/2`: features that were lifted to the Gaussians of a checkpoint, and the evidence for
-them;
-`refined/2`: the features after smoothing and knowledge, and how both were chosen.
+them; `refined/2`: the features after smoothing and knowledge, and how both were chosen.
 """
 
 from __future__ import annotations
@@ -42,12 +41,10 @@ class Refined(Record):
     """N Gaussians in the order of their checkpoint, C channels of the teacher.
 
     features:   f32 [N, C].
-    confidence: f32 [N] in [0, 1]: how many votes there are and how far they agree; 0 where nothing
-      is known.
-    notes:      what it started from, whether it was smoothed, views that knowledge counts for, what
-      a view counts for
-                where the teacher is unsure of the scene, and by smoothing and strength the
-                agreement of half the training views with the other half.
+    confidence: f32 [N] in [0, 1], from the number and agreement of votes; 0 without votes.
+    notes:      initial features, smoothing, weight of knowledge in views, weight of a view where
+      the teacher is unsure of the scene, and by smoothing and strength the agreement of the two
+      halves of the training views.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.refined/2"

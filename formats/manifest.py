@@ -1,4 +1,4 @@
-"""`artifact.json`: what an artifact says of itself, held to rules before anything is done with it.
+"""`artifact.json`, read and checked before any path or key in it is used.
 
 A key becomes a folder's name and a member's name a path: neither may lead anywhere else.
 """
@@ -20,7 +20,7 @@ KEY = re.compile(r"[0-9a-f]{16}")
 
 @dataclass
 class Manifest:
-    """What `artifact.json` holds. `files` maps relative POSIX paths to {"sha256", "bytes"}."""
+    """The contents of `artifact.json`. `files`: relative POSIX paths to {"sha256", "bytes"}."""
 
     schema: str  # "chebsplat.<name>/<n>"
     key: str
@@ -28,12 +28,12 @@ class Manifest:
     inputs: dict[str, dict[str, str]] = field(default_factory=dict)  # role -> {"key", "schema"}
     config: dict[str, Any] = field(default_factory=dict)
     seed: int | None = None
-    facts: dict[str, Any] = field(default_factory=dict)  # what the stage found, chose and left out
+    facts: dict[str, Any] = field(default_factory=dict)  # of the stage: figures, choices, omissions
     code: dict[str, Any] = field(default_factory=dict)  # {"hash", "commit", "dirty"}
     versions: dict[str, str] = field(default_factory=dict)
     device: str = "cpu"
     threads: int = 1
-    seconds: float = 0.0  # of all processes that worked on it
+    seconds: float = 0.0  # of all its processes
     # see `stages.runtime.machine.Stopwatch.processes`
     processes: list[dict[str, Any]] = field(default_factory=list)
     files: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -44,38 +44,35 @@ def measured_on(manifest: Manifest) -> str:
     compare where these are the same words.
     """
     threads = [f"{of['threads']} thread{'s' * (of['threads'] > 1)}" for of in manifest.processes]
-    named = [", ".join(filter(None, (of["gpu"], of["processor"]))) for of in manifest.processes]
-    said = dict.fromkeys(", ".join(words) for words in zip(named, threads, strict=True))
-    return " and ".join(said) or "a machine that was not recorded"
+    processors = [
+        ", ".join(filter(None, (of["gpu"], of["processor"]))) for of in manifest.processes
+    ]
+    machines = dict.fromkeys(", ".join(words) for words in zip(processors, threads, strict=True))
+    return " and ".join(machines) or "a machine that was not recorded"
 
 
 def is_key(value: object) -> bool:
-    """Whether a value names an artifact: 16 hexadecimal digits, and nothing that could lead out of
-    a folder.
-    """
+    """True for an artifact's key: 16 hexadecimal digits, so that it cannot lead out of a folder."""
     return isinstance(value, str) and KEY.fullmatch(value) is not None
 
 
 def is_member(name: str) -> bool:
-    """Whether a name stays below the folder that it is relative to, and is spelt in one way
-    only.
-    """
+    """True for a path that stays below its folder and is spelt in its only normal form."""
     path = PurePosixPath(name)
     inside = bool(path.parts) and not path.is_absolute() and ".." not in path.parts
     return inside and str(path) == name and "\0" not in name
 
 
 def remedy_of(path: Path) -> str:
-    """What a message advises about a damaged artifact."""
+    """The advice of messages about a damaged artifact."""
     return f"delete {path} and run its stage again"
 
 
 def parse_manifest(path: Path) -> Manifest:
-    """The manifest of the artifact `path`, whose members are not looked at. Raises InputError
-    naming the file.
+    """The manifest of the artifact `path`, its members not looked at.
 
-    Choices: what nothing but our own code writes is believed; held to a rule is what becomes a
-      path.
+    Raises:  InputError naming the file.
+    Choices: only values that become paths are checked; nothing but our own code writes the rest.
     """
     file = path / MANIFEST
     document = parse_json(file, remedy_of(path))

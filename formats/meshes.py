@@ -11,22 +11,21 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.extras import extra
 from chebsplat.formats.files import atomic_path
 from chebsplat.formats.gltf import linear_light, write_glb
 
 BLOCK = 16  # voxels along a block of the grid
-N_BLOCKS = 20_000  # that the grid begins with; it grows
-TRUNCATED = 4.0  # voxels, where the signed distance ends
-LEAST_WEIGHT = 3.0  # views, more than which have seen a voxel of the surface
-TOUCHED = 4  # open3d looks at every fourth pixel along each axis for blocks that a frame touches
-EASY = 100_000  # triangles that the quadric collapse takes about a second for
-PER_CELL = 0.85  # of a fused mesh's triangles that clustering in cells of its own voxels leaves
+N_BLOCKS = 20_000  # initial blocks of the grid, which grows
+TRUNCATED = 4.0  # voxels of truncation
+LEAST_WEIGHT = 3.0  # a voxel of the surface is in more views than this
+TOUCHED = 4  # open3d samples every fourth pixel along each axis for blocks of a frame
+EASY = 100_000  # triangles that the quadric collapse handles in about a second
+PER_CELL = 0.85  # share of a fused mesh's triangles that clustering by its own voxels keeps
 
 
 class Mesh(NamedTuple):
-    """vertices f32 [V, 3] scene units; triangles i32 [T, 3]; colors u8 [V, 3]; labels i32 [V], -1:
-    none, or None.
-    """
+    """vertices f32 [V, 3] scene units; triangles i32 [T, 3]; colors u8 [V, 3]; labels i32 [V]."""
 
     vertices: np.ndarray
     triangles: np.ndarray
@@ -35,9 +34,7 @@ class Mesh(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """depth f32 [H, W] scene units along the camera's axis, 0 where unknown; color u8 [H, W, 3]; K
-    [3, 3]; pose [4, 4] world to camera.
-    """
+    """depth f32 [H, W] scene units, 0 unknown; color u8 [H, W, 3]; K; pose world to camera."""
 
     depth: np.ndarray
     color: np.ndarray
@@ -45,11 +42,10 @@ class Frame(NamedTuple):
     pose: np.ndarray
 
 
-def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -> Mesh:
-    """The surface that depth images show, by a truncated signed distance on voxels of this edge,
-    scene units.
+def fuse_depth(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -> Mesh:
+    """The surface of depth images, by a truncated signed distance on voxels of this edge.
 
-    Args: open3d: the module; farthest: depth beyond it is not looked at.
+    Args: open3d: the module; voxel, farthest: scene units, depth beyond which is ignored.
     Choices: truncated at four voxels; a voxel counts that more than LEAST_WEIGHT views saw. open3d
       takes the pixel that a point falls into, so that the centre of the first one is at 0.5, as
       ours is. A frame that touches no block would be an error to it, and is passed over.
@@ -59,7 +55,7 @@ def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -
     grid = open3d.t.geometry.VoxelBlockGrid(
         names, (core.float32,) * 3, widths, voxel, BLOCK, N_BLOCKS, core.Device("CPU:0")
     )
-    n_seen = 0
+    n_frames = 0
     for frame in frames:
         touched = frame.depth[::TOUCHED, ::TOUCHED]
         if not ((touched > 0) & (touched < farthest)).any():
@@ -72,14 +68,14 @@ def fused(open3d: Any, frames: Iterable[Frame], voxel: float, farthest: float) -
         )
         blocks = grid.compute_unique_block_coordinates(depth, K, pose, 1.0, farthest, TRUNCATED)
         grid.integrate(blocks, depth, color, K, pose, 1.0, farthest, TRUNCATED)
-        n_seen += 1
-    found = grid.extract_triangle_mesh(LEAST_WEIGHT) if n_seen else None
-    if found is None or not len(found.vertex.positions):
+        n_frames += 1
+    mesh = grid.extract_triangle_mesh(LEAST_WEIGHT) if n_frames else None
+    if mesh is None or not len(mesh.vertex.positions):
         empty = np.zeros((0, 3))
         return Mesh(empty.astype(np.float32), empty.astype(np.int32), empty.astype(np.uint8))
-    colors = (found.vertex.colors.numpy() * 255).round().clip(0, 255).astype(np.uint8)
+    colors = (mesh.vertex.colors.numpy() * 255).round().clip(0, 255).astype(np.uint8)
     return Mesh(
-        found.vertex.positions.numpy(), found.triangle.indices.numpy().astype(np.int32), colors
+        mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.int32), colors
     )
 
 
@@ -87,30 +83,20 @@ def meshlab() -> Any:
     """The module that cleans meshes. Raises ConfigError where it, or a library that it is linked
     to, is missing.
     """
-    try:
-        import pymeshlab
-    except ImportError as error:  # of the package, or of a library that it is linked to
-        raise ConfigError(
-            f"cleaning a mesh needs pymeshlab ({error}); install the extra: pip install "
-            "'chebsplat[mesh]', and where a "
-            "library of the system is named, that one; or ask for the mesh as it is: --raw"
-        ) from None
-    return pymeshlab
+    return extra("pymeshlab", "cleaning a mesh", "ask for the mesh as it is: --raw")
 
 
-def cleaned(
+def clean_mesh(
     mesh: Mesh, n_triangles: int, least_diagonal: float, longest_hole: int, voxel: float
 ) -> Mesh:
-    """The mesh without what floats, its small holes closed, in at most so many triangles. Labels
-    are dropped.
+    """The mesh in at most `n_triangles`, floaters removed, small holes closed, labels dropped.
 
     Args: least_diagonal: of a connected part that stays, scene units; longest_hole: edges of a hole
-      that is closed;
-      voxel: edge of those that it was fused from, scene units.
+      that is closed; voxel: edge of those that it was fused from, scene units.
     Raises: ConfigError as `meshlab`.
     Choices: a vertex takes the colour of the nearest one before. Vertices are first clustered in
-      cubic cells, of a size that leaves what is wanted or EASY, and edges collapsed by quadrics
-      from there on: the collapse alone takes four times as long, for 0.002 of the F-score at 5 cm.
+      cubic cells, of a size that leaves n_triangles or EASY, and edges collapsed by quadrics from
+      there on: the collapse alone takes four times as long, for 0.002 of the F-score at 5 cm.
     """
     pymeshlab = meshlab()
     meshes = pymeshlab.MeshSet(verbose=False)
@@ -119,7 +105,7 @@ def cleaned(
         mincomponentdiag=pymeshlab.PureValue(least_diagonal)
     )
     meshes.meshing_repair_non_manifold_edges()
-    # a selection alone would be decimated
+    # otherwise only the selection would be decimated
     meshes.meshing_close_holes(maxholesize=longest_hole, newfaceselected=False)
     count, clustered = meshes.current_mesh().face_number(), max(n_triangles, EASY)
     if count > clustered:
@@ -130,10 +116,10 @@ def cleaned(
             targetfacenum=n_triangles, preserveboundary=True, preservenormal=True
         )
     meshes.meshing_remove_unreferenced_vertices()
-    kept = meshes.current_mesh()
+    simplified = meshes.current_mesh()
     vertices, triangles = (
-        kept.vertex_matrix().astype(np.float32),
-        kept.face_matrix().astype(np.int32),
+        simplified.vertex_matrix().astype(np.float32),
+        simplified.face_matrix().astype(np.int32),
     )
     if not len(vertices):
         return Mesh(vertices.reshape(0, 3), triangles.reshape(0, 3), np.zeros((0, 3), np.uint8))
@@ -141,7 +127,7 @@ def cleaned(
 
 
 def write_mesh(path: Path, mesh: Mesh, names: list[str] | None = None) -> None:
-    """Write the mesh as .ply or .glb, by the file's name; labels with it, and what they are called.
+    """Write the mesh as .ply or .glb, by the file's name, with its labels and their names.
 
     Raises: ConfigError on another suffix.
     Choices: PLY has an int property `label`, -1 for none, and comments `label ID NAME`. GLB has
@@ -192,13 +178,11 @@ def _glb(path: Path, mesh: Mesh, names: list[str]) -> None:
 
 
 def normals(mesh: Mesh) -> np.ndarray:
-    """Unit normals of the vertices, f32 [V, 3]: the mean of the triangles around, by area; z where
-    there are none.
-    """
+    """Unit normals of the vertices, f32 [V, 3]: area-weighted means of their triangles, or z."""
     a, b, c = mesh.vertices.astype(np.float64)[mesh.triangles.T]
-    found = np.zeros((len(mesh.vertices), 3))
+    sums = np.zeros((len(mesh.vertices), 3))
     for corner in mesh.triangles.T:
-        np.add.at(found, corner, np.cross(b - a, c - a))
-    lengths = np.linalg.norm(found, axis=1, keepdims=True)
-    unit = np.where(lengths > 0, found / np.where(lengths > 0, lengths, 1), [0.0, 0.0, 1.0])
+        np.add.at(sums, corner, np.cross(b - a, c - a))
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    unit = np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1), [0.0, 0.0, 1.0])
     return unit.astype(np.float32)

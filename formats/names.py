@@ -15,18 +15,14 @@ LONGEST = 200  # characters of a label or of a view's name
 
 
 def unprintable(text: str, allowed: str = "") -> bool:
-    """Whether text holds control characters, line ends or halves of surrogate pairs other than
-    those allowed.
-    """
+    """True where text holds control characters, line ends or lone surrogates, the allowed apart."""
     return any(
         unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") and c not in allowed for c in text
     )
 
 
 def check_names(names: Any, what: str, where: object, remedy: str) -> None:
-    """Raise InputError unless `names` is a list of different names. A line end within one is
-    allowed.
-    """
+    """Raise InputError unless `names` is a list of different names; they may hold line ends."""
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{where}: {what} are no list of names; {remedy}")
     for name in names:
@@ -41,23 +37,19 @@ def check_names(names: Any, what: str, where: object, remedy: str) -> None:
             raise InputError(f"{where}: {what}: {name!r} occurs {count} times; {remedy}")
 
 
-def suggest(word: str, known: Iterable[str], n: int = 3) -> list[str]:
-    """At most `n` of the known names that look most like a word, the most alike first; none if none
-    is like it.
-    """
-    return difflib.get_close_matches(word[:LONGEST], list(known), n)
+def suggest(word: str, vocabulary: Iterable[str], n: int = 3) -> list[str]:
+    """At most `n` words of the vocabulary that look most like a word, best first."""
+    return difflib.get_close_matches(word[:LONGEST], list(vocabulary), n)
 
 
 def natural(name: str) -> tuple[Any, ...]:
-    """Sort key under which frame_2 precedes frame_10; equal numbers are told apart by their
-    spelling.
-    """
+    """Sort key that puts frame_2 before frame_10; equal numbers differ by their spelling."""
     parts = re.split(r"(\d+)", name)
     return tuple(int(part) if k % 2 else part for k, part in enumerate(parts)), name
 
 
 def few(names: Iterable[str]) -> str:
-    """Three of some names, for a message, and whether there are more."""
+    """The first three of some names, for a message, and an ellipsis if there are more."""
     ordered = sorted(names, key=natural)
-    shown = [f"{name!a}"[1:-1] if unprintable(name) else name for name in ordered[:3]]
-    return ", ".join(shown) + ", ..." * (len(ordered) > 3)
+    printable = [f"{name!a}"[1:-1] if unprintable(name) else name for name in ordered[:3]]
+    return ", ".join(printable) + ", ..." * (len(ordered) > 3)

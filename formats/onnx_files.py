@@ -29,7 +29,7 @@ def model_files(path: Path) -> list[Path]:
 
 
 def weight_files(path: Path) -> tuple[str, ...]:
-    """What a graph calls the files of its weights, which lie beside it."""
+    """File names of a graph's external weights, relative to its folder."""
     state = regular(path, EXPORT)
     return _named(path, (state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns))
 
@@ -42,13 +42,13 @@ def model_sha256(path: Path) -> str:
 
 @lru_cache(maxsize=16)
 def _named(path: Path, stamp: tuple[int, ...]) -> tuple[str, ...]:
-    """`stamp` tells one content of the file from another: graphs may hold gigabytes."""
+    """Cached by `stamp`, which changes with the file: graphs may hold gigabytes."""
     import onnx
 
     try:
         model = onnx.load(path, load_external_data=False)
-    except Exception:  # protobuf's own, whose package is none that we depend on
-        return ()  # no graph: onnxruntime says so
+    except Exception:  # protobuf's own error, of a package that we do not depend on
+        return ()  # no graph; onnxruntime reports it
     external = onnx.TensorProto.EXTERNAL
     names = [
         os.path.normpath(entry.value)

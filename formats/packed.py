@@ -1,5 +1,4 @@
-"""Gaussians in 20 bytes each, for pages that a browser opens: quantised, in planes of bytes that
-compress well.
+"""Gaussians in 20 bytes each, for pages in a browser: quantised, in byte planes that compress well.
 
 `stages/pages/scene/splats.js` reads what this module writes. Planes are u8 [..., N], one Gaussian a
 column; numbers of more than one byte lie lowest byte first. A value is its integer times `step`
@@ -15,28 +14,25 @@ import numpy as np
 
 BYTES = {"means": 9, "log_scales": 3, "quats": 4, "opacities": 1, "colors": 3}  # of a Gaussian
 C0 = 0.28209479177387814  # of SH band 0, from coefficients to colours
-# ln of what a scale may be beside the longest axes: of 5 % of the Gaussians, thinner than a pixel,
-# and of 95 %, flat
+# ln of the range of scales, relative to the longest axes of 5 % (thinner than a pixel) and of 95 %
+# (flat) of the Gaussians
 LEAST, MOST = -4.0, 12.0
-# From the middle, in extents of 90 % of the centres: what lies farther is drawn there, as small as
-# it looks
+# from the middle, in extents of 90 % of the centres: Gaussians beyond are drawn there, scaled down
+# to the same apparent size
 FARTHEST = 1000.0
-COLORS = (-1.0, 3.0)  # of SH degree 0 in training's [0, 1]; beyond it no pixel can tell
+COLORS = (-1.0, 3.0)  # of SH degree 0 in training's [0, 1]; values beyond are invisible
 
 
 @dataclass
 class Packed:
-    """Arrays by name, and for each quantised one its `low` and `step`, lists of a number for each
-    axis or channel.
+    """Arrays by name, and `low` and `step` of each quantised one, a number an axis or channel.
 
     means:      u8 [3, 3, N], axis and byte; `low` and `step` in the scene's frame and units.
     log_scales: u8 [3, N]; quats: u8 [4, N], of u32: the largest entry's place in the 2 upper bits,
-      the others in order
-                (wxyz, the largest positive) as 10 bits each over ±1/√2.
+      the others in order (wxyz, the largest positive) as 10 bits each over ±1/√2.
     opacities:  u8 [N] of [0, 1]; colors: u8 [3, N], of SH degree 0, 1 is white.
-    sh1:        i8 [9, N], coefficients of band 1, coefficient-major; only where asked for.
-    features:   i8 [C, R], those that differ, and meanings: u16 [N], which of them is a Gaussian's;
-      only where given.
+    sh1:        i8 [9, N], coefficients of band 1, coefficient-major; optional.
+    features:   i8 [C, R], a dictionary, and meanings: u16 [N], each Gaussian's row of it; optional.
     """
 
     arrays: dict[str, np.ndarray]
@@ -44,13 +40,11 @@ class Packed:
 
 
 def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
-    """Quantise raw parameters (`formats.scene.Scene.parameters`). Raises ValueError on a degree
-    that is not 0 or 1.
+    """Quantise raw parameters (`Scene.parameters`). Raises ValueError on a degree over 1.
 
     Choices: 24 bits a coordinate, and FARTHEST, so that a stray Gaussian far off costs the others
-      nothing that shows; scales to 2 % or so, and 4 % at worst: what all others have for sizes
-      bounds those of a few; activated opacities, since logits would spend their bits where nothing
-      changes.
+      no visible precision; scales to about 2 %, at worst 4 %, clipped around the sizes of most;
+      activated opacities, since logits would spend their bits where nothing changes.
     """
     if sh_degree not in (0, 1):
         raise ValueError(f"a page holds SH degree 0 or 1, not {sh_degree}")
@@ -95,9 +89,7 @@ def drawn_near(means: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, n
 
 
 def along_a_curve(means: np.ndarray) -> np.ndarray:
-    """The order i64 [N] of centres [N, 3] along Morton's curve, on which neighbours follow one
-    another; 16 bits an axis of their box.
-    """
+    """Order i64 [N] of centres [N, 3] along Morton's curve, with 16 bits an axis of their box."""
     low = means.min(0)
     cells = (65535 * (means - low) / max((means.max(0) - low).max(), 1e-300)).astype(">u2")
     bits = np.unpackbits(np.ascontiguousarray(cells).view(np.uint8).reshape(-1, 3, 2), axis=2)
@@ -107,22 +99,22 @@ def along_a_curve(means: np.ndarray) -> np.ndarray:
 
 
 def unpack(packed: Packed) -> dict[str, np.ndarray]:
-    """Parameters as given to `pack`, float32, quaternions unit; opacities of 0 and 1 as logits of
-    ±20.
-    """
+    """Parameters as for `pack`, float32, unit quaternions; logits ±20 for opacities of 0 and 1."""
     arrays = packed.arrays
 
     def values(name: str, integers: np.ndarray) -> np.ndarray:
-        stated = packed.ranges[name]
-        found: np.ndarray = integers.T * np.array(stated["step"]) + np.array(stated.get("low", 0.0))
-        return found
+        span = packed.ranges[name]
+        dequantised: np.ndarray = integers.T * np.array(span["step"]) + np.array(
+            span.get("low", 0.0)
+        )
+        return dequantised
 
     bytes_of = arrays["means"].astype(np.uint32)
     means = values("means", bytes_of[:, 0] | bytes_of[:, 1] << 8 | bytes_of[:, 2] << 16)
     opacities = arrays["opacities"] / 255
     with np.errstate(divide="ignore"):
         logits = np.log(opacities / (1 - opacities)).clip(-20, 20)
-    found = {
+    parameters = {
         "means": means,
         "log_scales": values("log_scales", arrays["log_scales"]),
         "quats": from_smallest_three(arrays["quats"].astype(np.uint32)),
@@ -131,10 +123,10 @@ def unpack(packed: Packed) -> dict[str, np.ndarray]:
         "shN": np.zeros((len(means), 15, 3)),
     }
     if "sh1" in arrays:
-        found["shN"][:, :3] = values("sh1", arrays["sh1"]).reshape(-1, 3, 3)
+        parameters["shN"][:, :3] = values("sh1", arrays["sh1"]).reshape(-1, 3, 3)
     if "features" in arrays:
-        found["features"] = values("features", arrays["features"])[arrays["meanings"]]
-    return {name: value.astype(np.float32) for name, value in found.items()}
+        parameters["features"] = values("features", arrays["features"])[arrays["meanings"]]
+    return {name: value.astype(np.float32) for name, value in parameters.items()}
 
 
 def raw_parameters(
@@ -145,20 +137,20 @@ def raw_parameters(
     sh0: np.ndarray,
     sh: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """Raw parameters of quantised ones; alphas: bytes [N]; sh0 [N, 3]; sh [N, K, 3]."""
+    """Raw parameters from quantised ones; alphas: bytes [N]; sh0 [N, 3]; sh [N, K, 3]."""
     opacities = alphas / 255
     with np.errstate(divide="ignore"):  # 0 and 1
         logits = np.log(opacities / (1 - opacities))
     shN = np.zeros((len(means), 15, 3), np.float32)
     shN[:, : sh.shape[1]] = sh
-    found = {
+    raw = {
         "means": means,
         "log_scales": log_scales,
         "quats": quats,
         "logit_opacities": logits,
         "sh0": sh0[:, None],
     }
-    return {name: values.astype(np.float32) for name, values in found.items()} | {"shN": shN}
+    return {name: values.astype(np.float32) for name, values in raw.items()} | {"shN": shN}
 
 
 def signed(rows: np.ndarray) -> tuple[np.ndarray, dict[str, list[float]]]:
@@ -198,13 +190,13 @@ def from_smallest_three(planes: np.ndarray) -> np.ndarray:
     return unit
 
 
-OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # places beside the largest
+OTHERS = np.array(
+    [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]
+)  # indices other than the largest entry's
 
 
 def to_bytes(arrays: dict[str, np.ndarray]) -> tuple[bytes, dict[str, Any]]:
-    """Arrays one after the other, each from a multiple of 4 on, and where each lies: dtype, shape,
-    offset.
-    """
+    """Arrays one after the other, at multiples of 4; by name the dtype, shape, offset of each."""
     blob, places = bytearray(), {}
     for name, array in arrays.items():
         blob += bytes(-len(blob) % 4)
@@ -214,7 +206,7 @@ def to_bytes(arrays: dict[str, np.ndarray]) -> tuple[bytes, dict[str, Any]]:
 
 
 def from_bytes(blob: bytes, places: dict[str, Any]) -> dict[str, np.ndarray]:
-    """What `to_bytes` was given."""
+    """The arrays that `to_bytes` packed."""
     return {
         name: np.frombuffer(blob, at["dtype"], int(np.prod(at["shape"])), at["offset"]).reshape(
             at["shape"]

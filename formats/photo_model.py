@@ -1,6 +1,4 @@
-"""`model/1`: cameras, poses and points of photos that came without, as structure from motion found
-them.
-"""
+"""`model/1`: cameras, poses and points that structure from motion gave photos without poses."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """3DGS PLY files: the 62-float layout that viewers load, trimmed to the SH bands in use.
 
-`read_vertices` is the one door to reading PLY: what a header declares is held against the file's
-  size.
+`read_vertices` reads every PLY: counts in a header are checked against the file's size first.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ REST = {0: 0, 1: 3, 2: 8, 3: 15}  # coefficients beyond band 0, by degree
 _FIXED = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 _TAIL = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 HEADER = 1 << 20  # bytes that a header may take
-THIN = 1e-3  # of the smaller scale of a disc (2DGS): how thick it is taken
-# of the Gaussians of a file: beyond it the file is damaged, and not only some of them
+THIN = 1e-3  # thickness of a 2DGS disc, relative to its smaller scale
+# share of a file's Gaussians: beyond it the whole file counts as damaged
 MOST_UNUSABLE = 0.5
 _PART = re.compile(rb"^[ \t]*(?:element[ \t]+\S+[ \t]+(\d{1,30})|(property))\b", re.MULTILINE)
 
@@ -39,23 +38,20 @@ def write_ply(
     label_names: list[str] | None = None,
     world: World = HERE,
 ) -> None:
-    """Write raw parameters (`formats.gaussians.Gaussians.parameters`) as a binary little-endian
-    3DGS PLY.
+    """Write raw parameters (`formats.gaussians.Gaussians`) as a binary little-endian 3DGS PLY.
 
     Args:
       parameters: where `degrees` [N] are given, `sh_degree` follows `rot_3`.
       degree:     highest band to write; `f_rest` is channel-major and shorter below 3.
       labels:     [N] class ids, -1 none; `label` is then the last property.
       label_names: by id, written as comments `label ID NAME` of those that occur, in ASCII: what
-        else a name holds is
-                   escaped as Python does (`caf\\xe9`); `labels.json` beside a scene's PLY has the
-                   names themselves.
+        else a name holds is escaped as Python does (`caf\\xe9`); `labels.json` beside a scene's PLY
+        has the names themselves.
       world:      of the parameters; the file has its source's.
     Choices: normals are written as zeros, since some loaders hard-code their presence. Tags are
       floats like all else: Open3D skips a `ushort`, and gsply 0.4 and spz-js 1.2 take any other
-        type, or a second element, for the data.
-      Only x, y, z are doubles, and only of a scene far from its source's origin, which floats would
-      round to steps.
+      type, or a second element, for the data. Only x, y, z are doubles, and only of a scene far
+      from its source's origin, which floats would round to steps.
     """
     parameters = parameters | {
         "log_scales": parameters["log_scales"] + np.float32(np.log(world.scale))
@@ -95,15 +91,14 @@ def write_ply(
 def read_ply(
     path: Path, world: World = HERE
 ) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
-    """Raw parameters, file degree, and labels where the file has them. Normals and tags are
-    optional.
+    """Raw parameters, file degree, and labels or None. Normals and tags are optional.
 
     Args:   world: to bring the Gaussians into, from that of its source.
     Raises: InputError naming the file: not a PLY, truncated, not a 3DGS layout, or most values not
       finite.
     Choices: discs of two scales (2DGS) are THIN across them. The filter that mip-splatting, GOF and
       RaDe-GS keep beside the scales is fused into scales and opacities, as these export it.
-      `usable` says what is left out.
+      `drop_unusable` reports what is left out.
     """
     path = Path(path)
     vertex = read_vertices(path, "export the scene again")
@@ -124,13 +119,13 @@ def read_ply(
         raise InputError(f"{path} has {n_rest} f_rest properties; 0, 9, 24 or 45 are possible")
 
     def block(
-        wanted: list[str], inward: Callable[[np.ndarray], np.ndarray] = np.asarray
+        properties: list[str], inward: Callable[[np.ndarray], np.ndarray] = np.asarray
     ) -> np.ndarray:
-        with np.errstate(over="ignore"):  # of doubles; what is infinite then is refused below
-            return inward(np.stack([vertex[name] for name in wanted], 1)).astype(np.float32)
+        with np.errstate(over="ignore"):  # of doubles; infinities are refused below
+            return inward(np.stack([vertex[name] for name in properties], 1)).astype(np.float32)
 
     def whole(name: str, low: int, high: int) -> np.ndarray:
-        values: np.ndarray = np.asarray(vertex[name])[kept]
+        values: np.ndarray = np.asarray(vertex[name])[finite]
         if not ((values >= low) & (values <= high) & (values == np.round(values))).all():
             raise InputError(
                 f"{path}: {name} holds more than whole numbers {low} to {high}; "
@@ -158,10 +153,10 @@ def read_ply(
         parameters["log_scales"] = np.concatenate([parameters["log_scales"], thin], 1)
     if "filter_3D" in names:
         log.info("%s: its filter_3D is fused into scales and opacities", path)
-        parameters |= fused(
+        parameters |= fuse_filter(
             parameters["log_scales"], parameters["logit_opacities"], np.asarray(vertex["filter_3D"])
         )
-    parameters, kept = usable(path, parameters)
+    parameters, finite = drop_unusable(path, parameters)
     parameters["log_scales"] -= np.float32(np.log(world.scale))
     if "sh_degree" in names:
         parameters["degrees"] = whole("sh_degree", 0, degree).astype(np.uint8)
@@ -169,9 +164,10 @@ def read_ply(
     return parameters, degree, labels
 
 
-def fused(log_scales: np.ndarray, logits: np.ndarray, size: np.ndarray) -> dict[str, np.ndarray]:
-    """Gaussians widened by an isotropic one of standard deviation `size` [N] (scene units), their
-    integral kept.
+def fuse_filter(
+    log_scales: np.ndarray, logits: np.ndarray, size: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Gaussians widened by an isotropic one of deviation `size` [N] (scene units), integral kept.
 
     Choices: scale² + size² for each scale², and opacities times the root of the ratio of the
       determinants, as mip-splatting fuses its 3D filter. log_scales [N, 3], logits [N]; float64
@@ -186,11 +182,10 @@ def fused(log_scales: np.ndarray, logits: np.ndarray, size: np.ndarray) -> dict[
     return {"log_scales": wide.astype(np.float32), "logit_opacities": opacity.astype(np.float32)}
 
 
-def usable(
+def drop_unusable(
     path: Path, parameters: dict[str, np.ndarray]
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The parameters of the Gaussians that are finite, and which these are, bool [N]; a line says
-    how many are not.
+    """The parameters of finite Gaussians, and the mask [N] of these; a warning counts the rest.
 
     Raises:  InputError where more than MOST_UNUSABLE are not.
     Choices: an infinite logit, which converters write for 8-bit opacities of exactly 0 or 1,
@@ -206,28 +201,27 @@ def usable(
         name: np.isfinite(values).reshape(len(values), -1).all(1)
         for name, values in parameters.items()
     }
-    kept = np.logical_and.reduce(list(finite.values()))
-    if kept.all():
-        return parameters, kept
+    usable = np.logical_and.reduce(list(finite.values()))
+    if usable.all():
+        return parameters, usable
     worst = min(finite, key=lambda name: finite[name].sum())
-    if kept.mean() < MOST_UNUSABLE:
+    if usable.mean() < MOST_UNUSABLE:
         raise InputError(
-            f"{path}: {worst} holds non-finite values in {(~kept).sum()} rows; "
+            f"{path}: {worst} holds non-finite values in {(~usable).sum()} rows; "
             "export the scene again"
         )
     log.warning(
         "%s: %d of %d Gaussians are not finite (%s) and left out",
         path,
-        (~kept).sum(),
-        len(kept),
+        (~usable).sum(),
+        len(usable),
         worst,
     )
-    return {name: values[kept] for name, values in parameters.items()}, kept
+    return {name: values[usable] for name, values in parameters.items()}, usable
 
 
 def read_vertices(path: Path, remedy: str) -> Any:
-    """plyfile's element `vertex`, of scalar properties. Raises InputError naming the file and the
-    remedy.
+    """plyfile's element `vertex`, of scalar properties. Raises InputError naming file and remedy.
 
     Choices: a value takes a byte at least, in text and in binary; a header that declares more
       values than the file has bytes lies, and is refused before anything is allocated.

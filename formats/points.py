@@ -1,6 +1,4 @@
-"""`points/2`: registered cameras, and points with normals and local anisotropic covariances, and
-swept depth; point clouds in PLY files.
-"""
+"""`points/2`: registered cameras, points with covariances, swept depth; PLY point clouds."""
 
 from __future__ import annotations
 
@@ -15,7 +13,7 @@ from chebsplat.formats.ply import read_vertices
 from chebsplat.formats.record import Array, Record
 
 MOST = 20_000_000  # points; a room's scan has some hundred thousand
-FARTHEST = 1e6  # scene units: beyond, float32 tells no 0.06 apart
+FARTHEST = 1e6  # scene units: beyond, steps of float32 exceed 0.06
 
 
 @dataclass
@@ -30,8 +28,7 @@ class Points(Record):
       section 1).
     tracks:         i32 [T, 2] (point, view) observations; empty where points come from depth.
     notes:          how the points came about, reprojection errors, counts.
-    depths:         f32 [V, h, w] z that a sweep of the photos, reduced to this size, found; 0:
-      none; None: no sweep.
+    depths:         f32 [V, h, w] z by plane sweeps of the reduced photos, 0: none; None: no sweep.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.points/2"
@@ -50,25 +47,21 @@ class Points(Record):
 
 
 def thinned(points: Points, most: int, seed: int) -> Points:
-    """At most so many of the points, drawn alike from all and in their order; without the tracks of
-    any.
-    """
+    """At most `most` of the points, a uniform sample in their order; tracks are dropped."""
     if len(points.means) <= most:
         return points
-    kept = np.sort(np.random.default_rng(seed).choice(len(points.means), most, replace=False))
+    rows = np.sort(np.random.default_rng(seed).choice(len(points.means), most, replace=False))
     fewer = {
-        name: getattr(points, name)[kept] for name in ("means", "colors", "normals", "covariances")
+        name: getattr(points, name)[rows] for name in ("means", "colors", "normals", "covariances")
     }
     return replace(points, **fewer, tracks=points.tracks[:0])
 
 
 def read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Positions f32 [N, 3] and colours u8 [N, 3], None without any. Raises InputError naming file
-    and remedy.
-    """
+    """Positions f32 [N, 3] and colours u8 [N, 3] or None. Raises InputError naming the file."""
     vertex = read_vertices(path, "restore it: no other points take its place")
-    known = {part.name for part in vertex.properties}
-    if not known.issuperset("xyz"):
+    properties = {part.name for part in vertex.properties}
+    if not properties.issuperset("xyz"):
         raise InputError(f"{path} has no x, y, z; restore it: no other points take its place")
     if not 0 < len(vertex.data) <= MOST:
         raise InputError(
@@ -84,7 +77,7 @@ def read_cloud(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
             "restore it, or move the scene's origin into the scene"
         )
     channels = ("red", "green", "blue")
-    if not known.issuperset(channels):
+    if not properties.issuperset(channels):
         return points, None
     colors = np.stack([np.asarray(vertex[channel]) for channel in channels], 1)
     if colors.dtype != np.uint8:

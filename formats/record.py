@@ -1,9 +1,8 @@
-"""Artifacts of numbers: a dataclass whose arrays are the arrays of one zarr v3 group, and whose
-other fields are the group's attributes.
+"""Artifacts of numbers: a dataclass stored as one zarr v3 group of arrays and attributes.
 
-`zarr.open_group(path)["means"][:]` reads any of them. What a reader relies on is checked in three
-places: the manifest has every file with its size, `zarr.json` files are compared with their digest,
-  and each chunk carries its crc32c.
+`zarr.open_group(path)["means"][:]` reads any of them. Integrity is checked in three ways: the
+manifest has every file with its size, `zarr.json` files are compared with their digest, and each
+chunk carries its crc32c.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from chebsplat.formats import artifact
 from chebsplat.formats.files import parse_json
 from chebsplat.formats.manifest import Manifest, remedy_of
 
-BATCH = 2**25  # bytes that are compressed at a time
+BATCH = 2**25  # bytes compressed at a time
 ROWS = 65_536  # entries of the first axis in a chunk, where an array isn't read view by view
 METADATA = "zarr.json"
 
@@ -39,10 +38,8 @@ class Array:
     """Storage of a field of a `Record`.
 
     Args:
-      axes:     a name an axis, or its length where that is fixed; an axis has one length throughout
-        a record.
-      by_view:  a chunk holds one entry of the first axis, and the array stays on disk until it is
-        indexed.
+      axes:     names, or lengths where fixed; a name has one length throughout a record.
+      by_view:  one entry of the first axis a chunk; the array stays on disk until it is indexed.
       any_value: nan and infinities may be stored.
     """
 
@@ -64,13 +61,12 @@ class Record:
     COMPRESSED: ClassVar[bool] = True
 
     def write(self, out: Path) -> None:
-        """Fill the directory that `artifact.publish` yields. An array that lies in `out` already
-        stays.
+        """Fill the directory of `artifact.publish`; an array that lies in `out` already stays.
 
         Raises: ValueError naming an array of another dtype or shape, or a value that is not finite.
         """
         stored = dict(_arrays_of(self))
-        values = {name: _converted(name, value, spec) for name, (spec, value) in stored.items()}
+        values = {name: _convert(name, value, spec) for name, (spec, value) in stored.items()}
         check_lengths({name: (spec.axes, values[name].shape) for name, (spec, _) in stored.items()})
         self.write_attributes(out)
         for name, (spec, _) in stored.items():
@@ -113,9 +109,7 @@ class Record:
 
 
 def read_attributes(path: Path, manifest: Manifest) -> dict[str, Any]:
-    """Attributes of an artifact's group, without opening an array. Raises InputError naming the
-    damaged file.
-    """
+    """Attributes of an artifact's group; no array is opened. Raises InputError naming the file."""
     document = parse_json(artifact.checked(path, manifest, METADATA), remedy_of(path))
     attributes: dict[str, Any] = document["attributes"]
     return attributes
@@ -132,9 +126,7 @@ def reading(path: Path) -> Iterator[None]:
 
 
 class StoredArray:
-    """An array of a published artifact, read as it is indexed: `array[i]` and `array[:]` give numpy
-    arrays.
-    """
+    """An array of a published artifact; `array[i]` and `array[:]` read numpy arrays from disk."""
 
     def __init__(self, root: Path, manifest: Manifest, name: str):
         """Open the array `name` of the artifact at `root`; no value is read yet.
@@ -196,8 +188,8 @@ def write_array(path: Path, values: np.ndarray, spec: Array, compressed: bool = 
     """Write an array whole.
 
     Choices: chunks are compressed side by side in memory, so many at a time as BATCH bytes hold,
-      and written one by
-      one: twice as fast as zarr's own files, and where a disk is full no other write is under way.
+      and written one by one: twice as fast as zarr's own files, and where a disk is full no other
+      write is under way.
     """
     files: dict[str, Any] = {}
     array = create_array(MemoryStore(files), values.shape, spec, compressed)
@@ -210,7 +202,7 @@ def write_array(path: Path, values: np.ndarray, spec: Array, compressed: bool = 
 
 
 def _put(files: dict[str, Any], folder: Path) -> None:
-    """Write what a memory store holds, by name, into a folder."""
+    """Write the files of a memory store into a folder."""
     for name, buffer in files.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -226,8 +218,7 @@ def chunk_names(array: zarr.Array[Any]) -> Iterator[str]:
 
 
 def check_lengths(arrays: dict[str, tuple[tuple[str | int, ...], tuple[int, ...]]]) -> None:
-    """Hold shapes against axes. Raises ValueError naming the first array that differs, or None of
-    them.
+    """Compare shapes with axes. Raises ValueError naming the first array that differs.
 
     Args: arrays: by name its axes and its shape.
     """
@@ -245,9 +236,7 @@ def check_lengths(arrays: dict[str, tuple[tuple[str | int, ...], tuple[int, ...]
 
 @dataclass(frozen=True)
 class Layout:
-    """Fields of a record: arrays by name, those that may be absent, records within, and names of
-    attributes.
-    """
+    """Fields of a record: arrays by name, optional arrays, records within, names of attributes."""
 
     arrays: dict[str, Array]
     optional: set[str]
@@ -260,7 +249,7 @@ def layout_of(cls: type[Record]) -> Layout:
     """Sort the fields of a record by how they are stored."""
     layout = Layout({}, set(), {}, [])
     hints = get_type_hints(cls, include_extras=True)
-    for name in (field.name for field in fields(cls)):  # type: ignore[arg-type]  # all are dataclasses
+    for name in (field.name for field in fields(cls)):  # type: ignore[arg-type]  # a dataclass
         parts = (hints[name], *get_args(hints[name]))
         spec = next((part for part in parts if isinstance(part, Array)), None)
         within = next(
@@ -278,9 +267,7 @@ def layout_of(cls: type[Record]) -> Layout:
 
 
 def _arrays_of(record: Record, prefix: str = "") -> Iterator[tuple[str, tuple[Array, Any]]]:
-    """Name, specification and value of each array that a record holds, those of records within
-    too.
-    """
+    """Name, specification and value of each array of a record and of the records within."""
     layout = layout_of(type(record))  # type: ignore[arg-type]  # mypy takes no class for hashable
     for name, spec in layout.arrays.items():
         if (value := getattr(record, name)) is not None:
@@ -321,16 +308,14 @@ def _built(
     return cls(**values)
 
 
-def _converted(name: str, value: Any, spec: Array) -> Any:
-    """A value in the dtype that it is stored in; a zarr array is in its place already and returned
-    unchanged.
-    """
+def _convert(name: str, value: Any, spec: Array) -> Any:
+    """A value in its stored dtype; a zarr array is in its place already and returned unchanged."""
     if not isinstance(value, np.ndarray | StoredArray):
         return value
     values = np.asarray(value)
     if values.dtype != spec.dtype and not np.can_cast(values.dtype, spec.dtype, "same_kind"):
         raise ValueError(f"{name} is {values.dtype}, expected {spec.dtype}")
-    with np.errstate(over="ignore"):  # what is infinite then is refused below
+    with np.errstate(over="ignore"):  # infinities are refused below
         converted = values.astype(spec.dtype, copy=False)
     if (
         converted is not values

@@ -1,6 +1,4 @@
-"""`scene/4`: the exported scene: PLY and SPZ for viewers, ragged arrays for us, a label dictionary
-and a summary.
-"""
+"""`scene/4`: the exported scene: PLY and SPZ for viewers, ragged arrays, label names, a summary."""
 
 from __future__ import annotations
 
@@ -32,9 +30,8 @@ class Scene:
     """N Gaussians sorted by SH degree, stably; raw float32 parameters as in `gaussians/2`.
 
     parameters: `means`, `log_scales`, `quats`, `logit_opacities`, `sh0` [N,1,3], `shN` [N,15,3]
-      (zero above a
-                Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics `features`
-                [N,C].
+      (zero above a Gaussian's degree), `degrees` u8 [N] ascending; where there are semantics
+      `features` [N,C].
     cameras:    of the views it can be evaluated on.
     order:      i64 [N], row of each Gaussian in the checkpoint.
     labels:     i32 [N] class index, -1 none; None without semantics. label_names, label_embeddings
@@ -55,9 +52,9 @@ class Scene:
     def write(self, out: Path) -> dict[str, int]:
         """Fill the directory that `artifact.publish` yields; returns bytes by part.
 
-        Raises:  ValueError where features of more than MOST_MEANINGS differ.
+        Raises:  ValueError on more than MOST_MEANINGS distinct features.
         Choices: `scene.ply` is trimmed to the highest degree in use, and `scene.spz` beside it
-          where SPZ can hold the scene; both are in the source's world. Features are rows of a
+          if SPZ can represent the scene; both are in the source's world. Features are rows of a
           dictionary, in 16-bit fixed point: as small as halves, 20 times as exact. Degrees are
           stored in the checkpoint's order, which they then tell.
         """
@@ -113,9 +110,7 @@ class Scene:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """The exported scene at `path`, all in memory. Raises InputError naming the damaged file
-        and the remedy.
-        """
+        """The exported scene at `path`, all in memory. Raises InputError naming file and remedy."""
         path = Path(path)
         stored = RaggedScene.read(path)
         order = np.argsort(stored.degrees, kind="stable")
@@ -154,12 +149,10 @@ class Scene:
 
 @dataclass
 class RaggedScene(Record):
-    """`Scene` as stored: a Gaussian pays only for the SH bands that it keeps, and two bytes for
-    what it means.
+    """`Scene` as stored: SH bands up to each Gaussian's degree, features as rows of a dictionary.
 
     All but `degrees` are in order of degree. sh1, sh2, sh3: rows of the Gaussians that keep the
-      band. features: a dictionary in fixed point, of which `meanings` are rows; steps: what an
-    integer of it counts.
+    band. features: the dictionary in fixed point, with `meanings` as its rows; steps: their unit.
     """
 
     SCHEMA: ClassVar[str] = Scene.SCHEMA

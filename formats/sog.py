@@ -1,6 +1,4 @@
-"""PlayCanvas' SOG, version 2: a zip of lossless WebP pictures, a pixel a Gaussian, and
-meta.json.
-"""
+"""PlayCanvas' SOG, version 2: a zip of meta.json and lossless WebP images, a pixel a Gaussian."""
 
 from __future__ import annotations
 
@@ -21,8 +19,8 @@ from chebsplat.formats.spz import LARGEST, REMEDY, least_turned
 from chebsplat.formats.world import HERE, World
 
 LIGHT_STEP = 1 / 64  # of a coefficient, in the palette of light, at least
-ROUNDS = 20  # of Lloyd's, for a codebook
-DAMAGED = (ValueError, LookupError, TypeError, OSError, OverflowError)  # what others' files raise
+ROUNDS = 20  # of Lloyd's algorithm, for a codebook
+DAMAGED = (ValueError, LookupError, TypeError, OSError, OverflowError)  # raised by foreign files
 ACROSS = 64  # rows of the palette of light beside one another in its picture
 MOST_LIGHTS = 65_536  # rows of the palette, which two bytes count
 
@@ -33,9 +31,9 @@ def write_sog(
     """Write raw parameters (`formats.gaussians.Gaussians.parameters`) as one .sog file.
 
     Args:   degree: highest band to write; world: of the parameters; the file has its source's.
-    Choices: order and axes of `spz.write_spz`. The palette of light holds every Gaussian's own, in
-      the finest steps from LIGHT_STEP on in which they are no more than MOST_LIGHTS: what was
-      pruned shares one row.
+    Choices: order and axes of `spz.write_spz`. The palette of light has the distinct rows of all
+      Gaussians, in the finest steps from LIGHT_STEP on that give at most MOST_LIGHTS: pruned
+      Gaussians share one row.
     """
     means = world.outward(parameters["means"]).astype(np.float64)
     order = along_a_curve(means)
@@ -50,10 +48,10 @@ def write_sog(
         pixels = np.zeros((-(-len(values) // columns) * columns, 4), np.uint8)
         pixels[:, 3] = 255
         pixels[: len(values), : values.shape[1]] = values
-        kept = io.BytesIO()
+        stream = io.BytesIO()
         image = Image.fromarray(pixels.reshape(-1, columns, 4))
-        image.save(kept, "WEBP", lossless=True, quality=80, method=4, exact=True)
-        files[f"{name}.webp"] = kept.getvalue()
+        image.save(stream, "WEBP", lossless=True, quality=80, method=4, exact=True)
+        files[f"{name}.webp"] = stream.getvalue()
         return f"{name}.webp"
 
     bent = np.sign(means[order]) * np.log1p(np.abs(means[order]))
@@ -74,8 +72,8 @@ def write_sog(
     meta["scales"] = {"codebook": sizes, "files": [picture("scales", scales)]}
     quat_bytes = np.concatenate([others, 252 + place[:, None]], 1)
     meta["quats"] = {"files": [picture("quats", quat_bytes)]}
-    shown = np.concatenate([colors, alphas], 1)
-    meta["sh0"] = {"codebook": shades, "files": [picture("sh0", shown)]}
+    appearance = np.concatenate([colors, alphas], 1)
+    meta["sh0"] = {"codebook": shades, "files": [picture("sh0", appearance)]}
     if K:
         palette, rows = lights(parameters["shN"][order, :K])
         entries, levels = codebook(palette)
@@ -96,16 +94,14 @@ def lights(shN: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     step = LIGHT_STEP
     while True:
         steps = np.rint(shN.reshape(len(shN), -1) / step).astype(np.int16)
-        found, rows = np.unique(steps, axis=0, return_inverse=True)
-        if len(found) <= MOST_LIGHTS:
-            return step * found.reshape(len(found), -1, 3), rows.reshape(-1)
+        palette, rows = np.unique(steps, axis=0, return_inverse=True)
+        if len(palette) <= MOST_LIGHTS:
+            return step * palette.reshape(len(palette), -1, 3), rows.reshape(-1)
         step *= 2
 
 
 def codebook(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
-    """The nearest of 256 levels to each of values [...], and the levels, of Lloyd's rounds from
-    quantiles on.
-    """
+    """Nearest of 256 levels to each of values [...], and the levels, by Lloyd from quantiles."""
     flat = np.sort(values.ravel().astype(np.float64))
     levels = np.quantile(flat, np.linspace(0, 1, 256))
     for _ in range(ROUNDS):
@@ -118,9 +114,7 @@ def codebook(values: np.ndarray) -> tuple[np.ndarray, list[float]]:
 
 
 def read_sog(path: Path) -> tuple[dict[str, np.ndarray], int]:
-    """Raw parameters in the axes of PLY files, and the degree. Raises InputError naming the
-    file.
-    """
+    """Raw parameters in the axes of PLY files, and the degree. Raises InputError with the path."""
     try:
         with zipfile.ZipFile(path) as whole:
             if sum(entry.file_size for entry in whole.infolist()) > LARGEST:
@@ -134,10 +128,10 @@ def read_sog(path: Path) -> tuple[dict[str, np.ndarray], int]:
                 return np.asarray(Image.open(io.BytesIO(content)).convert("RGBA"))
 
             def pixels(of: str, which: int = 0) -> np.ndarray:
-                found = picture(of, which).reshape(-1, 4)[: meta["count"]]
-                if len(found) < meta["count"]:
-                    raise ValueError(f"{of} has {len(found)} pixels for {meta['count']} Gaussians")
-                whole_numbers: np.ndarray = found.astype(np.int64)
+                values = picture(of, which).reshape(-1, 4)[: meta["count"]]
+                if len(values) < meta["count"]:
+                    raise ValueError(f"{of} has {len(values)} pixels for {meta['count']} Gaussians")
+                whole_numbers: np.ndarray = values.astype(np.int64)
                 return whole_numbers
 
             def values(of: str, entries: np.ndarray) -> np.ndarray:

@@ -1,6 +1,4 @@
-"""Splats as other programs keep them: PLY, SPZ, SOG, glTF (written only), .splat (read only), and
-the folder that 3DGS writes.
-"""
+"""Splats of other programs: PLY, SPZ, SOG, GLB (written), .splat and 3DGS' folder (read)."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.files import atomic_path, regular
 from chebsplat.formats.gltf import write_splat_glb
 from chebsplat.formats.packed import C0, raw_parameters
-from chebsplat.formats.ply import read_ply, usable, write_ply
+from chebsplat.formats.ply import drop_unusable, read_ply, write_ply
 from chebsplat.formats.sog import read_sog, write_sog
 from chebsplat.formats.spz import LARGEST, REMEDY, read_spz, write_spz
 from chebsplat.formats.world import HERE, World
@@ -24,27 +22,25 @@ WRITTEN = (".ply", ".spz", ".sog", ".glb")
 
 
 def is_splat(name: str) -> bool:
-    """Whether a path is called like a splat, or is a folder as 3DGS writes it."""
+    """True for a path that is named like a splat, or is a folder as 3DGS writes it."""
     return Path(name).suffix.lower() in READ + OTHERS or os.path.isdir(
         os.path.join(name, "point_cloud")
     )
 
 
 def splat_file(path: Path) -> Path:
-    """The file of a splat: itself, or of 3DGS' output folder the PLY of the last iteration. Raises
-    InputError.
-    """
+    """The file of a splat, or the last PLY of 3DGS' output folder. Raises InputError."""
     if os.path.isdir(path):
-        found = [
+        iterations = [
             ply
             for ply in path.glob("point_cloud/iteration_*/point_cloud.ply")
             if _iteration(ply) >= 0
         ]
-        if not found:
+        if not iterations:
             raise InputError(
                 f"{path} holds no point_cloud/iteration_*/point_cloud.ply; name the file of a splat"
             )
-        return max(found, key=_iteration)
+        return max(iterations, key=_iteration)
     if path.suffix.lower() in OTHERS:
         raise InputError(
             f"{path}: {path.suffix.lower()} is not read ({', '.join(READ)} are); {REMEDY}"
@@ -61,8 +57,7 @@ def _iteration(ply: Path) -> int:
 def read_splats(
     path: Path, world: World = HERE
 ) -> tuple[dict[str, np.ndarray], int, np.ndarray | None]:
-    """Raw parameters, degree and labels, as `ply.read_ply`, of any file or folder that `splat_file`
-    takes.
+    """Raw parameters, degree and labels, as `ply.read_ply`, of any splat that `splat_file` accepts.
 
     Args:   world: to bring the Gaussians into, from that of its source.
     Raises: InputError naming the file.
@@ -75,7 +70,7 @@ def read_splats(
     if path.stat().st_size > LARGEST:
         raise InputError(f"{path} has more than the {LARGEST >> 20} MiB that are read; thin it out")
     parameters, degree = reader(path)
-    parameters = usable(path, parameters)[0]
+    parameters = drop_unusable(path, parameters)[0]
     moved = {
         "means": world.inward(parameters["means"]),
         "log_scales": parameters["log_scales"] - np.log(world.scale),

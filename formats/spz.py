@@ -1,5 +1,4 @@
-"""Niantic's SPZ, gzip of planes of bytes: read in versions 2 to 4, written in 3, which viewers that
-do not know 4 open, too.
+"""Niantic's SPZ, gzip of planes of bytes: read in versions 2 to 4, written in 3 (older viewers).
 
 SPZ looks along -z, y up: half a turn about x from the axes of PLY files.
 """
@@ -25,16 +24,16 @@ REMEDY = "export it as PLY, for example with SuperSplat"
 LARGEST = 512 << 20  # bytes unpacked: 8 million Gaussians of degree 3
 # magic, version, Gaussians, degree, bits of a coordinate's fraction, flags
 HEADER = struct.Struct("<4sIIBBBx")
-HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # and how many streams there are, and where their sizes
+HEADER_4 = struct.Struct("<4sIIBBBBI12x")  # then number of streams, offset of sizes
 SIZES = struct.Struct("<QQ")  # of a stream: compressed, plain
-# these change their sign with y and z, of the 15 coefficients beyond band 0
+# signs of the 15 coefficients beyond band 0 when y and z are negated
 TURNED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-# What bytes tell apart, where the format leaves that to the writer; docs/usage.md has figures
-FINE = 3.0  # steps of a coordinate in the median Gaussian's thickness, at least
+# quantisation that the format leaves to the writer; figures in docs/usage.md
+FINE = 3.0  # steps of a coordinate per thickness of the median Gaussian, at least
 ROTATION_STEP = 8  # of 511, in which an entry of a quaternion reaches 1/√2
 LIGHT_STEP = 4  # of 128, in which a coefficient reaches 1
-LEAST_STEPS = 4096  # of a coordinate across 90 % of a scene, where it lies far from the origin
-MOST_CUT = 0.01  # of the Gaussians, whose size SPZ may not have
+LEAST_STEPS = 4096  # of a coordinate across 90 % of a scene that is far from the origin
+MOST_CUT = 0.01  # share of Gaussians with a size that SPZ may lack
 
 
 def write_spz(
@@ -44,10 +43,10 @@ def write_spz(
 
     Args:   degree: highest band to write; world: of the parameters; the file has its source's.
     Raises: DataFailure where centres or sizes do not fit into 24 and 8 bits.
-    Choices: Gaussians lie along a curve, so that neighbours in the file are neighbours in space. Of
-      the 24 orders and signs of a Gaussian's axes, which all say the same, that is written whose
-      turn is the smallest: its quaternions hold less to tell. Bits that no picture shows are zero:
-      gzip gains by them. A Gaussian far off is drawn nearer, as `packed.pack` does.
+    Choices: Gaussians are in the order of a curve, so that neighbours in the file are neighbours in
+      space. Of the 24 equivalent orders and signs of a Gaussian's axes, the one with the smallest
+      rotation is written: its quaternions have less entropy. Bits without a visible effect are
+      zero, for gzip. A distant Gaussian is drawn nearer, as in `packed.pack`.
     """
     means, log_scales = drawn_near(
         world.outward(parameters["means"]), parameters["log_scales"] + np.log(world.scale)
@@ -73,37 +72,35 @@ def write_spz(
 
 def _fraction_bits(means: np.ndarray, log_scales: np.ndarray) -> int:
     """Bits of a coordinate's fraction; errors of `write_spz`."""
-    wanted = np.ceil(np.log2(FINE) - np.median(log_scales.min(1)) / np.log(2)).clip(0, 23)
+    needed = np.ceil(np.log2(FINE) - np.median(log_scales.min(1)) / np.log(2)).clip(0, 23)
     fitting = np.floor(np.log2((2**23 - 1) / np.abs(means).max().clip(1)))
     low, high = np.quantile(means, (0.05, 0.95), axis=0)
-    coarse = fitting < wanted and 2**fitting * (high - low).max() < LEAST_STEPS
+    coarse = fitting < needed and 2**fitting * (high - low).max() < LEAST_STEPS
     largest = log_scales.max(1)
     if coarse or ((largest < -10) | (largest > 255 / 16 - 10)).mean() > MOST_CUT:
         raise DataFailure(
             "SPZ has sizes of 0.00005 to 380 units and centres of 24 bits, into which this scene "
             "does not fit; export it as .ply"
         )
-    return int(min(wanted, fitting))
+    return int(min(needed, fitting))
 
 
 def least_turned(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same Gaussians by other axes: unit quaternions [N, 4] (wxyz) of the smallest turn, and
-    the log-scales [N, 3] along its axes.
+    """The same Gaussians by other axes: unit quaternions [N, 4] (wxyz) of the smallest rotation,
+    and the log-scales [N, 3] along its axes.
     """
     unit = quats.astype(np.float64)
     unit[np.linalg.norm(unit, axis=1) == 0] = [1, 0, 0, 0]  # as renderers have it
     turns = Rotation.create_group("O")
     real = unit @ (turns.as_quat(scalar_first=True) * [1, -1, -1, -1]).T  # of each turn undone
-    chosen = np.abs(real).argmax(1)
-    axes = np.abs(turns.as_matrix()).round()[chosen]
-    turned = Rotation.from_quat(unit, scalar_first=True) * turns[chosen]
+    nearest = np.abs(real).argmax(1)
+    axes = np.abs(turns.as_matrix()).round()[nearest]
+    turned = Rotation.from_quat(unit, scalar_first=True) * turns[nearest]
     return turned.as_quat(scalar_first=True), np.einsum("nij,ni->nj", axes, log_scales)
 
 
 def to_smallest_three(quats: np.ndarray) -> np.ndarray:
-    """Unit quaternions [N, 4] (wxyz) as bytes [N, 4], in steps of ROTATION_STEP; of
-    `_smallest_three`.
-    """
+    """Unit quaternions [N, 4] (wxyz) as bytes [N, 4] for `_smallest_three`, by ROTATION_STEP."""
     xyzw, rows = quats[:, [1, 2, 3, 0]], np.arange(len(quats))
     place = np.abs(xyzw).argmax(1)
     xyzw = xyzw * np.where(xyzw[rows, place] < 0, -1, 1)[:, None]
@@ -118,9 +115,7 @@ def to_smallest_three(quats: np.ndarray) -> np.ndarray:
 
 
 def read_spz(path: Path) -> tuple[dict[str, np.ndarray], int]:
-    """Raw parameters in the axes of PLY files, and the degree. Raises InputError naming the
-    file.
-    """
+    """Raw parameters in the axes of PLY files, and the degree. Raises InputError with the path."""
     data = path.read_bytes()
     try:
         plain = data if data[:4] == b"NGSP" else zlib.decompressobj(31).decompress(data, LARGEST)
@@ -165,9 +160,7 @@ def read_spz(path: Path) -> tuple[dict[str, np.ndarray], int]:
 
 
 def _unpacked(data: bytes, sizes: list[int]) -> list[bytes]:
-    """The streams of version 4, of these sizes. Raises ValueError, RuntimeError or
-    struct.error.
-    """
+    """Streams of version 4, of these sizes. Raises ValueError, RuntimeError or struct.error."""
     *_, n_streams, table = HEADER_4.unpack_from(data)
     at, streams = table + n_streams * SIZES.size, []
     for k, size in enumerate(sizes):

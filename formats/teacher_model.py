@@ -1,6 +1,4 @@
-"""A 2D teacher as its user brings it: `NAME.onnx`, and `NAME.toml` beside it that says how to use
-it.
-"""
+"""A user's 2D teacher: `NAME.onnx`, and `NAME.toml` beside it that says how to use it."""
 
 from __future__ import annotations
 
@@ -22,9 +20,11 @@ if TYPE_CHECKING:
     import numpy as np
 
 EMBEDDED = Path(__file__).parents[1] / "teachers/embedded.onnx"  # ships with the package
-MAX_LABELS = 2**15 - 1  # what maps of int16 can number
-MAX_SIDE = 4096  # pixels of what a model is fed
-LARGEST = 4  # mean or std of colours in 0 to 1, where a model is fed less than they are, too
+MAX_LABELS = 2**15 - 1  # the limit of int16 maps
+MAX_SIDE = 4096  # pixels of a model's input
+LARGEST = (
+    4  # largest plausible mean or std of colours in 0 to 1, of models with rescaled inputs, too
+)
 RESAMPLING = ("nearest", "lanczos", "bilinear", "bicubic", "box", "hamming")  # by Pillow's numbers
 FILES = ("labels", "text", "tokenizer")
 TEXT_PACKAGE = "minilm"  # `text` may name the optional extra instead of a file
@@ -32,21 +32,21 @@ TEXT_PACKAGE = "minilm"  # `text` may name the optional extra instead of a file
 
 @dataclass(frozen=True)
 class TeacherModel:
-    """What `read_teacher` returns; docs/teachers.md says what each key means to a user.
+    """A 2D teacher and its settings; docs/teachers.md explains each key of the TOML to users.
 
     path:      the image encoder, `[1, 3, H, W]` float32 -> `[1, C, h, w]`.
     output:    "features", or "logits" of a closed-set segmenter: channel = index into the label
       list.
-    guessed:   whether the TOML leaves that out, and labels that are names alone, without `text`,
-               are taken for a segmenter's.
+    guessed:   true where the TOML has no `output`, and labels without embeddings and without `text`
+      suggest a segmenter.
     tensor:    the graph's output, or None: the one that fits.
-    mean, std: of colours in [0, 1], in the order that the model is fed, `order`: "RGB" or "BGR".
-    resample:  how photos are resized, of RESAMPLING.
+    mean, std: of colours in [0, 1], in the model's channel `order`, "RGB" or "BGR".
+    resample:  filter for resizing photos, of RESAMPLING.
     size:      (H, W) that the model takes, or None: any whose sides are multiples of `multiple`.
     base:      long side in pixels that an image is resized to at scale 1, or None: its own.
-    origin:    where it was fetched, sha256: of the model then (`model_sha256`); None if it was not.
-    labels:    table of names and embeddings; text, tokenizer: encoder of any words; prompt: what a
-      name is put into.
+    origin:    source of a fetched model, sha256: its `model_sha256` then; None if not fetched.
+    labels:    table of names and embeddings; text, tokenizer: encoder of any words; prompt: a
+      template for names.
     """
 
     path: Path
@@ -80,9 +80,9 @@ class TeacherModel:
 
     def verify(self) -> None:
         """Raises InputError if the encoder is not the one whose checksum was recorded."""
-        if self.sha256 is not None and (found := model_sha256(self.path)) != self.sha256:
+        if self.sha256 is not None and (digest := model_sha256(self.path)) != self.sha256:
             raise InputError(
-                f"{self.path} has the sha256 {found}, {self.settings} says {self.sha256}: it was "
+                f"{self.path} has the sha256 {digest}, {self.settings} says {self.sha256}: it was "
                 "damaged or replaced; "
                 f"remove the folder and fetch it again (chebsplat get-teacher), or correct `sha256`"
             )
@@ -130,7 +130,7 @@ def read_teacher(path: Path) -> TeacherModel:
     _check_range(settings, values)
     teacher = TeacherModel(path, **({"name": path.stem} | values))
     if "output" not in values and teacher.labels is not None and teacher.text is None:
-        with suppress(InputError):  # which whoever needs the table raises
+        with suppress(InputError):  # raised again where the table is needed
             if read_label_table(teacher.labels)[1] is None:
                 teacher = replace(teacher, output="logits", guessed=True)
     if teacher.output == "features" and teacher.labels is None and teacher.text is None:
@@ -202,13 +202,13 @@ def _check(settings: Path, key: str, value: Any) -> None:
         near = suggest(key, RULES, 1)
         advice = f"did you mean {near[0]}?" if near else f"known are {', '.join(RULES)}"
         raise InputError(f"{settings}: no such key {key}; {advice}")
-    wanted, fits = RULES[key]
+    expected, fits = RULES[key]
     if not fits(value):
-        raise InputError(f"{settings}: {key} = {value!r:.60} is not {wanted}; correct it")
+        raise InputError(f"{settings}: {key} = {value!r:.60} is not {expected}; correct it")
 
 
 def _check_range(settings: Path, values: dict[str, Any]) -> None:
-    """Mean and std are of colours in 0 to 1: with those of 0 to 255 all photos would look alike.
+    """Refuse mean and std of colours in 0 to 255: with them all photos would look alike.
 
     Choices: a std of 1 beside such a mean is of colours in 0 to 255, too, as Caffe's models have
       it.

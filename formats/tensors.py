@@ -1,9 +1,8 @@
-"""Named arrays in files: safetensors of ours, checked for dtype and shape on reading; .npy and .npz
-of users.
+"""Named arrays in files: our safetensors, checked for dtype and shape, and users' .npy and .npz.
 
-What .npy and .npz declare is held against their bytes before anything is allocated. Measured traps
-this closes: a header of 100 bytes that declares terabytes, a zip of 400 KB that unpacks to 3 GB, a
-  FIFO.
+Sizes that .npy and .npz declare are compared with their bytes before anything is allocated.
+Measured traps: a header of 100 bytes that declares terabytes, a zip of 400 KB that unpacks to 3 GB,
+  a FIFO.
 """
 
 from __future__ import annotations
@@ -28,16 +27,14 @@ from chebsplat.formats.files import regular
 from chebsplat.formats.manifest import Manifest, remedy_of
 
 Spec = tuple[Any, ...]  # of an array: its dtype, then its sizes
-LARGEST = 256 << 20  # bytes that the arrays asked for may take in all, unpacked
-# what numpy and zipfile raise, of which a RuntimeError is an unknown compression
+LARGEST = 256 << 20  # bytes of all requested arrays, unpacked
+# raised by numpy and zipfile; RuntimeError is an unknown compression
 _BROKEN = (OSError, ValueError, EOFError, RuntimeError, MemoryError, KeyError, TypeError,
            zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError)  # fmt: skip
 
 
 def write_tensors(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write named arrays. Raises ValueError on a name with a non-finite value: nothing bad is ever
-    published.
-    """
+    """Write named arrays. Raises ValueError naming an array with nan or infinity."""
     for name, array in arrays.items():
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
             raise ValueError(
@@ -52,8 +49,7 @@ def read_tensors(
     """Read a listed file after comparing its digest.
 
     Args:
-      specs: what must be there, e.g. ("float32", "n", 3); a string is a size that has to agree
-        wherever it occurs.
+      specs: arrays required, e.g. ("float32", "n", 3); a named size agrees wherever it occurs.
     Raises: InputError naming the file, the array and the remedy.
     """
     path = artifact.checked(root, manifest, name)
@@ -71,8 +67,8 @@ def read_tensors(
                 f"{path}: {key} is {arrays[key].dtype}, expected {dtype}; {remedy_of(root)}"
             )
         fits = len(stored) == len(shape) and all(
-            n == (sizes.setdefault(want, n) if isinstance(want, str) else want)
-            for n, want in zip(stored, shape, strict=True)
+            n == (sizes.setdefault(size, n) if isinstance(size, str) else size)
+            for n, size in zip(stored, shape, strict=True)
         )
         if not fits:
             raise InputError(
@@ -88,15 +84,13 @@ def read_npy(path: Path, remedy: str, largest: int = LARGEST) -> np.ndarray:
 
 
 def read_npz(
-    path: Path, wanted: Sequence[str], remedy: str, largest: int = LARGEST
+    path: Path, names: Sequence[str], remedy: str, largest: int = LARGEST
 ) -> dict[str, np.ndarray]:
-    """Those of the wanted arrays that an .npz file holds; the others stay packed. Raises as
-    `read_npy`.
-    """
+    """Those of the named arrays that an .npz holds; others stay packed. Raises as `read_npy`."""
     arrays: dict[str, np.ndarray] = {}
     with _readable(path, ".npz", remedy), zipfile.ZipFile(path) as archive:
         members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
-        for name in wanted:
+        for name in names:
             if name in members:
                 with archive.open(members[name]) as handle:
                     arrays[name] = _array(handle, members[name].file_size, largest)
@@ -124,9 +118,7 @@ def _readable(path: Path, kind: str, remedy: str) -> Iterator[None]:
 
 
 def _array(handle: IO[bytes], size: int, largest: int) -> np.ndarray:
-    """The array that begins here, in a file (or a member of one) of `size` bytes. Raises
-    ValueError.
-    """
+    """The array at the handle of a file (or zip member) of `size` bytes. Raises ValueError."""
     version = np.lib.format.read_magic(handle)
     read_header: Any = (
         np.lib.format.read_array_header_1_0

@@ -1,6 +1,4 @@
-"""Videos from outside: the one door to PyAV's reader. Containers that cameras write, recognised by
-content.
-"""
+"""Videos from outside, read by PyAV: containers that cameras write, recognised by content."""
 
 from __future__ import annotations
 
@@ -8,18 +6,15 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.formats.extras import extra
 from chebsplat.formats.files import regular
 from chebsplat.formats.images import MAX_PIXELS, MAX_SIDE
-
-if TYPE_CHECKING:
-    import numpy as np
 
 SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mts", ".3gp")
 # FFmpeg reads playlists, too, which name other files
@@ -28,14 +23,14 @@ HDR = (16, 18)  # transfer functions PQ and HLG, ITU-T H.273
 
 
 def is_video(name: str) -> bool:
-    """Whether a file's name is that of a video; hidden files are none."""
+    """True for the name of a video; hidden files are none."""
     return os.path.splitext(name)[1].lower() in SUFFIXES and not name.startswith(".")
 
 
 @dataclass(frozen=True)
 class Video:
-    """width, height: as it is meant to be seen; n_frames: about how many there are; rate: frames/s,
-    about; hdr: whether its colours are coded for a brighter screen than a photo's.
+    """width, height: upright, square pixels; n_frames, rate (frames/s): estimates; hdr: colours
+    coded for a brighter screen than a photo's.
     """
 
     width: int
@@ -45,10 +40,8 @@ class Video:
     hdr: bool
 
 
-class Shown:
-    """A decoded frame as it is meant to be seen. time: seconds, as the file says; None where it
-    does not.
-    """
+class VideoFrame:
+    """A decoded frame, upright. time: seconds by the file; None where it gives none."""
 
     def __init__(self, frame: Any, width: int, height: int):
         self.time: float | None = frame.time
@@ -75,22 +68,16 @@ def quarters(frame: Any) -> int:
 
 def require_av(path: Path) -> Any:
     """The package av. Raises InputError with the command that installs it, if it is missing."""
-    try:
-        return import_module("av")
-    except ImportError:
-        raise InputError(
-            f"{path} is a video, which the package av reads: .venv/bin/pip install -e '.[video]' "
-            "installs it"
-        ) from None
+    return extra("av", f"{path} is a video, which", error=InputError)
 
 
 def describe(path: Path) -> Video:
-    """What a video is; decodes its first frame. Raises InputError naming the file."""
+    """Size, length and rate of a video; decodes its first frame. Raises InputError."""
     with _opened(path) as (container, stream):
         first = next(container.decode(stream), None)
         if first is None:
             raise InputError(f"{path} holds no frame; copy it again")
-        width, height = _seen_size(path, stream, first)
+        width, height = _upright_size(path, stream, first)
         rate = float(stream.average_rate or stream.guessed_rate or 30)
         seconds = container.duration / 1e6 if container.duration else 0
         return Video(
@@ -102,21 +89,17 @@ def describe(path: Path) -> Video:
         )
 
 
-def frames(path: Path) -> Iterator[Shown]:
-    """All frames, in the order in which they are shown. Raises InputError naming the file, where it
-    is damaged.
-    """
+def frames(path: Path) -> Iterator[VideoFrame]:
+    """All frames in order of presentation. Raises InputError naming a damaged file."""
     size: tuple[int, int] | None = None
     with _opened(path) as (container, stream):
         for frame in container.decode(stream):
-            size = size or _seen_size(path, stream, frame)
-            yield Shown(frame, *size)
+            size = size or _upright_size(path, stream, frame)
+            yield VideoFrame(frame, *size)
 
 
-def _seen_size(path: Path, stream: Any, frame: Any) -> tuple[int, int]:
-    """(width, height) of a frame with square pixels, upright. Raises InputError if it is too
-    large.
-    """
+def _upright_size(path: Path, stream: Any, frame: Any) -> tuple[int, int]:
+    """(width, height) of an upright frame of square pixels. Raises InputError if too large."""
     width, height = (
         max(round(frame.width * float(stream.sample_aspect_ratio or 1)), 1),
         frame.height,

@@ -1,6 +1,4 @@
-"""Where the scene of artifacts lies in its source's world: moved and scaled where single precision
-asks for it.
-"""
+"""The similarity between a scene's artifacts and its source's world, for single precision."""
 
 from __future__ import annotations
 
@@ -12,30 +10,27 @@ import numpy as np
 
 from chebsplat.errors import InputError
 
-# scene units that cameras may lie apart: near planes and thresholds are made for rooms
+# extents of cameras in scene units, for which near planes and thresholds are made
 EXTENTS = (0.1, 1000.0)
-FARTHEST = 1000.0  # extents from the origin: float32 tells 6e-5 of an extent apart there
+FARTHEST = 1000.0  # extents from the origin, where float32 has steps of 6e-5 extents
 
 
 @dataclass(frozen=True)
 class World:
-    """A point of the source's world is origin + scale · that of the artifacts. Depths are scaled
-    alike.
-    """
+    """A source's point is origin + scale · the artifacts' point; depths scale alike."""
 
     origin: tuple[float, ...] = (0.0, 0.0, 0.0)
     scale: float = 1.0
 
     @classmethod
     def of(cls, eyes: np.ndarray) -> Self:
-        """The world for a scene whose cameras stand at `eyes` [V, 3] of its source's; those that
-        are not finite tell nothing.
+        """The world for cameras at `eyes` [V, 3] in the source's; non-finite ones are ignored.
 
         Choices: a scene of sane size about a sane origin stays as it is. Others are brought to an
           extent of 1 to 10 units by a power of ten, and about the origin by a round number near the
           middle of the cameras, so that a scene that was moved or scaled by such a number is as
-          before. One place alone has no extent: its scale stays.
-          A few cameras gone astray decide nothing: middle and extent are medians.
+          before. One place alone has no extent: its scale stays. A few cameras gone astray decide
+          nothing: middle and extent are medians.
         """
         eyes = eyes[np.isfinite(eyes).all(1)]
         if not len(eyes):
@@ -52,14 +47,12 @@ class World:
 
     @classmethod
     def read(cls, notes: Mapping[str, Any]) -> Self:
-        """The world that an artifact's notes tell of; the artifacts' own where they tell of none.
-        Raises InputError.
-        """
-        held = notes.get("world")
-        if held is None:
+        """The world in an artifact's notes; the identity where they lack it. Raises InputError."""
+        world_note = notes.get("world")
+        if world_note is None:
             return cls()
         try:
-            world = cls(tuple(map(float, held["origin"])), float(held["scale"]))
+            world = cls(tuple(map(float, world_note["origin"])), float(world_note["scale"]))
             if not (
                 np.isfinite(world.origin).all()
                 and len(world.origin) == 3
@@ -68,19 +61,17 @@ class World:
                 raise ValueError
         except (KeyError, TypeError, ValueError):
             raise InputError(
-                f"world {str(held)[:80]} is no place of a scene; make the artifact again"
+                f"world {str(world_note)[:80]} is no place of a scene; make the artifact again"
             ) from None
         return world
 
     @property
     def notes(self) -> dict[str, Any]:
-        """For `read`; nothing where the worlds are one."""
+        """The entry that `read` understands; empty for the identity."""
         return {} if self == HERE else {"world": {"origin": list(self.origin), "scale": self.scale}}
 
     def outward(self, points: np.ndarray) -> np.ndarray:
-        """Points [..., 3] in the source's world, f64; f32 and untouched where the worlds are
-        one.
-        """
+        """Points [..., 3] in the source's world, f64; unchanged f32 where the worlds are one."""
         return (
             points
             if not self.notes
@@ -104,4 +95,4 @@ class World:
         return poses
 
 
-HERE = World()  # of scenes that are as their source has them
+HERE = World()  # the identity

@@ -1,1 +1,1 @@
-"""What runs: configuration to keys to a DAG, freshness, and the `chebsplat` command."""
+"""Configuration to keys to a DAG of stages, freshness, and the `chebsplat` command."""

@@ -1,6 +1,4 @@
-"""Python's way in: open a finished scene, bring a scene up to date, run one stage. The command line
-does the same.
-"""
+"""The Python interface, as of the command: open a scene, bring it up to date, run one stage."""
 
 from __future__ import annotations
 
@@ -55,13 +53,15 @@ def train(
     Raises: ConfigError or InputError before anything runs; ChebsplatError if a stage fails, whose
       log says why.
     """
-    used = device_of(device)
-    chosen = plans(str(capture), None, settings, ablation, running=True, device=used)
-    if execute(chosen, None, cores or os.cpu_count() or 1, used):
+    computing_device = device_of(device)
+    scene_plans = plans(
+        str(capture), None, settings, ablation, running=True, device=computing_device
+    )
+    if execute(scene_plans, None, cores or os.cpu_count() or 1, computing_device):
         raise ChebsplatError(
             f"{capture} could not be finished; the lines above name the stage and its log"
         )
-    return load(store.work() / chosen[-1].title)
+    return load(store.work() / scene_plans[-1].title)
 
 
 def run_stage(
@@ -70,8 +70,7 @@ def run_stage(
     inputs: Mapping[str, str | Path] | None = None,
     **settings: dict[str, Any],
 ) -> Path:
-    """Run one stage in this process and publish its artifact at `out`; nothing if it is there
-    already.
+    """Run one stage in this process and publish its artifact at `out`, unless it is there.
 
     Args: name: of a stage; inputs: artifacts by role (`chebsplat STAGE --help` lists them);
       settings: sections by name.
@@ -82,14 +81,16 @@ def run_stage(
         raise ConfigError(
             f"no stage is called {name}" + (f"; did you mean {near[0]}?" if near else "")
         )
-    stage, given = STAGES[name], {role: Path(path) for role, path in (inputs or {}).items()}
-    needed = {role for role, _ in stage.inputs}
-    if unfit := sorted(needed - given.keys()) or sorted(given.keys() - stage.roles.keys()):
-        raise ConfigError(f"{name} {'needs' if unfit[0] in needed else 'does not read'} "
+    stage, artifacts = STAGES[name], {role: Path(path) for role, path in (inputs or {}).items()}
+    required = {role for role, _ in stage.inputs}
+    if unfit := sorted(required - artifacts.keys()) or sorted(
+        artifacts.keys() - stage.roles.keys()
+    ):
+        raise ConfigError(f"{name} {'needs' if unfit[0] in required else 'does not read'} "
                           f"inputs[{unfit[0]!r}]; "
-                          f"it needs {', '.join(sorted(needed)) or 'none'}")  # fmt: skip
+                          f"it needs {', '.join(sorted(required)) or 'none'}")  # fmt: skip
     with TemporaryDirectory() as folder:
         config = Path(folder) / "settings.json"
         config.write_text(json.dumps(settings))
-        publish(name, import_module(f"chebsplat.stages.{name}").run, Path(out), given, config)
+        publish(name, import_module(f"chebsplat.stages.{name}").run, Path(out), artifacts, config)
     return Path(out)

@@ -1,4 +1,4 @@
-"""Plans that a command or a call from Python asks for: of a scene or a sequence, up to a stage."""
+"""Plans for a command or a call from Python: of a scene or a sequence, up to a stage."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.names import suggest
 from chebsplat.pipelines.planning import sequences
 from chebsplat.pipelines.planning.plan import Overrides, Plan, Planner, merged, overrides
+from chebsplat.pipelines.work.scenes import beside
 from chebsplat.stages.registry import STAGES
 
 
@@ -22,7 +23,8 @@ def plans(
 ) -> list[Plan]:
     """The plan of a scene, or the plans of a sequence.
 
-    knowledge: `knowledge.start`, if any; newer, quality: as of `Planner`.
+    scene: of a scene of ours and a folder beside that are called alike, the folder; knowledge:
+    `knowledge.start`, if any; newer, quality: as of `Planner`.
     """
     if (scene is None) == (sequence is None):
         raise ConfigError("name one of scene= and sequence=")
@@ -31,14 +33,14 @@ def plans(
     planner = Planner(running=running, device=device, newer=newer, quality=quality)
     try:
         if sequence is not None:
-            return sequences.chain(planner, sequence, settings, ablation)
-        return [planner.plan(str(scene), settings, ablation)]
+            return sequences.plan_sequence(planner, sequence, settings, ablation)
+        return [planner.plan(beside(str(scene)), settings, ablation)]
     finally:
         planner.save()
 
 
-def checked_stage(stage: str | None, chosen: list[Plan]) -> str | None:
-    """Raises ConfigError for a stage that does not exist or that this scene leaves out."""
+def checked_stage(stage: str | None, scene_plans: list[Plan]) -> str | None:
+    """`stage`, if the plans have it. Raises ConfigError on one that is unknown or left out."""
     if stage is None:
         return None
     if stage not in STAGES:
@@ -46,7 +48,7 @@ def checked_stage(stage: str | None, chosen: list[Plan]) -> str | None:
         raise ConfigError(
             f"no stage is called {stage}" + (f"; did you mean {near[0]}?" if near else "")
         )
-    for plan in chosen:
+    for plan in scene_plans:
         if stage not in plan.targets:
             raise ConfigError(
                 f"{plan.title} leaves out {stage}: {plan.left_out.get(stage, 'not needed')}"

@@ -1,6 +1,4 @@
-"""agree: how far views agree on what the same points are; a teacher that does not know a scene is
-found early.
-"""
+"""agree: agreement of views on the labels of the same points, an early check of the teacher."""
 
 from __future__ import annotations
 
@@ -26,8 +24,7 @@ AGREED = 0.3  # agreement that no teacher has by chance
 
 
 def run(job: Job) -> None:
-    """The training views' agreement on the same points, without true labels (docs/method.md,
-    section 9).
+    """Agreement of the training views on labels of the same points (docs/method.md, section 9).
 
     Reads `capture`, `points` and `features`. Writes `agreement`.
     """
@@ -36,16 +33,16 @@ def run(job: Job) -> None:
     views = training_views(capture, points, features)
     rows = even(points)
     rng = np.random.default_rng(SEED)
-    chosen = np.sort(rng.choice(rows, min(settings.n_points, len(rows)), replace=False))
-    said = labels_of(job, capture, points, features, views, chosen)
+    sample = np.sort(rng.choice(rows, min(settings.n_points, len(rows)), replace=False))
+    votes = labels_of(job, capture, points, features, views, sample)
     eyes = centers(points.cam_from_world)[[place for _, place, _ in views]]
-    row, first, second = far_pairs(points.means[chosen], eyes, said >= 0).T
+    row, first, second = far_pairs(points.means[sample], eyes, votes >= 0).T
     names = features.label_names
-    found = between(said[row, first], said[row, second], len(names))
-    value = float(found.value) if len(row) else None
+    agreement = between(votes[row, first], votes[row, second], len(names))
+    value = float(agreement.value) if len(row) else None
     labels = {
         name: {"share": float(share), "agreement": float(of_label)}
-        for name, share, of_label in zip(names, found.share, found.by_label, strict=True)
+        for name, share, of_label in zip(names, agreement.share, agreement.by_label, strict=True)
         if share > 0
     }
     job.facts |= {
@@ -59,19 +56,16 @@ def run(job: Job) -> None:
     elif value >= AGREED and (sure := sure_of(features, [at for _, _, at in views])) < UNSURE:
         job.facts["doubt"] = (
             f"views agree by {value:.2f} on what points are (1: always, 0: by chance), and the "
-            "teacher is sure by "
-            f"{sure:.2f} only: its outputs are flat, as of a softmax taken twice, of logits that "
-            "were scaled down, or "
-            "of photos in another range than it was trained on; `chebsplat check-teacher` tries "
-            "the usual ones"
+            f"teacher is sure by {sure:.2f} only: its outputs are flat, as of a softmax taken "
+            "twice, of logits that were scaled down, or of photos in another range than it was "
+            "trained on; `chebsplat check-teacher` tries the usual ones"
         )
         log.warning("%s", job.facts["doubt"])
     elif value < settings.low:
         job.facts["doubt"] = (
             f"views agree by {value:.2f} on what points are (1: always, 0: by chance), below "
-            f"{settings.low:g}: the 2D "
-            "teacher does not know this scene; name another (docs/teachers.md), or "
-            "teacher.kind=none for colour alone"
+            f"{settings.low:g}: the 2D teacher does not know this scene; name another "
+            "(docs/teachers.md), or teacher.kind=none for colour alone"
         )
         log.warning("%s", job.facts["doubt"])
     else:
@@ -80,7 +74,7 @@ def run(job: Job) -> None:
 
 
 def sure_of(features: Features, views: list[int]) -> float:
-    """How sure a segmenter is of its likeliest class; 1 of others, whose cosines do not tell."""
+    """Sureness of a segmenter in its likeliest class; 1 of others, as cosines are no certainty."""
     if features.convention.get("output") != "logits" or features.confidence is None:
         return 1.0
     mean = np.mean([np.asarray(features.confidence[view], np.float32).mean() for view in views])
@@ -90,27 +84,28 @@ def sure_of(features: Features, views: list[int]) -> float:
 def training_views(
     capture: Capture, points: Points, features: Features
 ) -> list[tuple[int, int, int]]:
-    """Where each training view with a pose stands in capture, points and features. Raises
-    InputError, DataFailure.
+    """Indices (in capture, points, features) of each training view with a pose.
+
+    Raises: InputError on artifacts of several scenes, DataFailure where there is no such view.
     """
-    row, taught = (
+    row, feature_row = (
         {name: k for k, name in enumerate(names)} for names in (capture.names, features.names)
     )
-    if unknown := [name for name in points.names if name not in row or name not in taught]:
+    if unknown := [name for name in points.names if name not in row or name not in feature_row]:
         raise InputError(
             f"the points have a view {unknown[0]} that capture or features lack; "
             "pass those of one scene"
         )
-    found = [
-        (row[name], k, taught[name])
+    views = [
+        (row[name], k, feature_row[name])
         for k, name in enumerate(points.names)
         if not capture.is_test[row[name]]
     ]
-    if not found:
+    if not views:
         raise DataFailure(
             "no training view has a camera; lower ingest.test_every's share of test views"
         )
-    return found
+    return views
 
 
 def labels_of(
@@ -119,43 +114,41 @@ def labels_of(
     points: Points,
     features: Features,
     views: list[tuple[int, int, int]],
-    chosen: np.ndarray,
+    sample: np.ndarray,
 ) -> np.ndarray:
-    """The label that each view says of each chosen point, i64 [N, V]; -1 where the view does not
-    see it.
+    """Labels that the views [V] give the points `sample` [N], i64 [N, V]; -1 where not visible.
 
-    Choices: what hides a point is told by depth, where the capture has it in the frame of the
-      points; by the tracks of structure from motion, whose points were found in the views that see
-      them; otherwise by nearer points.
+    Choices: visibility is by depth, where the capture has it in the frame of the points; by the
+      tracks of structure from motion, where there are any; otherwise by nearer points.
     """
     means, size = points.means.astype(np.float64), capture.size
     depths = capture.depth if capture.cam_from_world is not None else None
     number_of = np.full(len(means), -1)
-    number_of[chosen] = np.arange(len(chosen))
-    # the last row: of points that are not chosen
-    found_in = np.zeros((len(chosen) + 1, len(points.names)), bool)
-    found_in[number_of[points.tracks[:, 0]], points.tracks[:, 1]] = True
-    said = np.full((len(chosen), len(views)), UNSEEN, np.int64)
-    for (number, (row, place, taught)), _ in job.progress.track(
+    number_of[sample] = np.arange(len(sample))
+    # the last row: of points outside the sample
+    tracked = np.zeros((len(sample) + 1, len(points.names)), bool)
+    tracked[number_of[points.tracks[:, 0]], points.tracks[:, 1]] = True
+    votes = np.full((len(sample), len(views)), UNSEEN, np.int64)
+    for (number, (row, place, feature_row)), _ in job.progress.track(
         enumerate(views), len(views), "agree"
     ):
         image = project(means, points.Ks[place], points.cam_from_world[place], size)
         if depths is not None:
-            seen = unhidden(image, size, depths[row])[chosen]
+            visible = unhidden(image, size, depths[row])[sample]
         elif len(points.tracks):
-            seen = np.isfinite(image[chosen, 0]) & found_in[:-1, place]
+            visible = np.isfinite(image[sample, 0]) & tracked[:-1, place]
         else:
-            seen = unhidden(image, size)[chosen]
-        columns, rows = image[chosen[seen], :2].astype(np.int64).T
+            visible = unhidden(image, size)[sample]
+        columns, rows = image[sample[visible], :2].astype(np.int64).T
         if features.pseudo_labels is None:
             labels = decode_labels(
-                features.features[taught].astype(np.float32), features.label_embeddings
+                features.features[feature_row].astype(np.float32), features.label_embeddings
             )
         else:
-            labels = features.pseudo_labels[taught]
+            labels = features.pseudo_labels[feature_row]
         height, width = labels.shape
         of_points = labels[rows * height // size[1], columns * width // size[0]].astype(np.int64)
         if capture.loss_mask is not None:
             of_points[~capture.loss_mask[row][rows, columns]] = UNSEEN
-        said[seen, number] = of_points
-    return said
+        votes[visible, number] = of_points
+    return votes

@@ -3,7 +3,7 @@
 See docs/method.md, section 8.
 
 It is computed from the teacher, its words and reference images, and from nothing of a scene, so
-that what one scene learns about shape and meaning carries over to the next.
+that knowledge of shape and meaning carries over from one scene to the next.
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ CHECKED = 20_000  # pixels whose labels before and after are compared
 
 
 def run(job: Job) -> None:
-    """The directions of a teacher's features that scenes are trained in (docs/method.md, section
-    8).
+    """Directions of a teacher's features to train scenes in (docs/method.md, section 8).
 
     Reads no artifact: a teacher, its words and reference images. Writes `channels`.
     """
@@ -68,8 +67,7 @@ def run(job: Job) -> None:
             if words is not None and words.shape[1] != n_channels:
                 raise InputError(
                     f"{teacher.path} has {n_channels} channels, {teacher.labels} embeds in "
-                    f"{words.shape[1]}; export "
-                    "them from one model"
+                    f"{words.shape[1]}; export them from one model"
                 )
         features = network.features(image, grid, (1.0,), False, name)
         moments.add(features)
@@ -80,9 +78,13 @@ def run(job: Job) -> None:
         raise DataFailure(
             f"{teacher.path} gives zero features on all {count} reference images; export it again"
         )
-    known = np.zeros((0, len(moments.products))) if words is None else words
-    matrix, energy = maths.channel_map(moments, known, settings.n_channels)
-    notes: dict[str, Any] = {"n_pixels": moments.count, "n_words": len(known), "n_images": count}
+    embeddings = np.zeros((0, len(moments.products))) if words is None else words
+    matrix, energy = maths.channel_map(moments, embeddings, settings.n_channels)
+    notes: dict[str, Any] = {
+        "n_pixels": moments.count,
+        "n_words": len(embeddings),
+        "n_images": count,
+    }
     notes |= {"reference": settings.reference or "generated rooms", "digest": teacher.digest()}
     lost = float(np.sqrt(max(1 - energy[matrix.shape[1] - 1], 0)))
     job.facts |= notes | {"n_channels": matrix.shape[1], "of": len(matrix), "relative_error": lost}
@@ -93,19 +95,17 @@ def run(job: Job) -> None:
 
 
 def shipped(teacher: TeacherModel, settings: ChannelsSection) -> Path | None:
-    """The artifact of this stage that lies beside the teacher, if it is of the same files and
-    settings.
-    """
+    """The artifact of this stage beside the teacher, if it is of the same files and settings."""
     if not teacher.channels.is_dir():
         return None
     manifest, unnamed = read_manifest(teacher.channels, ChannelMap.SCHEMA), {"model"}
-    asked = settings.model_dump(mode="json", exclude=unnamed)
-    given = {
+    expected = settings.model_dump(mode="json", exclude=unnamed)
+    recorded = {
         name: value for name, value in manifest.config["channels"].items() if name not in unnamed
     }
     return (
         teacher.channels
-        if given == asked and manifest.facts.get("digest") == teacher.digest()
+        if recorded == expected and manifest.facts.get("digest") == teacher.digest()
         else None
     )
 

@@ -1,6 +1,4 @@
-"""describe: the shape about each point of a surface: Chebyshev descriptors at four radii (Eqs
-1-6).
-"""
+"""describe: Chebyshev descriptors of the shape about surface points, at four radii (Eqs 1-6)."""
 
 from __future__ import annotations
 
@@ -16,8 +14,7 @@ from chebsplat.stages.shape_models.surfaces import Cloud, scene_unit, surface_in
 
 
 def run(job: Job) -> None:
-    """What the point encoder sees of the points that depth or a sweep shows (docs/method.md,
-    section 2).
+    """Describe the shape about points of depth or of a sweep (docs/method.md, section 2).
 
     Reads `capture` and `points`. Writes `descriptors`. They are of no point where a scene shows too
     little of a surface.

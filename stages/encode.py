@@ -1,6 +1,4 @@
-"""encode: features of the shape about each point, by the transformers of the knowledge that ships
-(Eq 7).
-"""
+"""encode: features of the shape about each point, by the shipped transformers (Eq 7)."""
 
 from __future__ import annotations
 
@@ -17,17 +15,14 @@ from chebsplat.stages.shape_models.answers import inputs_of
 
 
 def run(job: Job) -> None:
-    """What shape says of a scene before any teacher does (docs/method.md, section 14).
+    """Encode the shape about each described point (docs/method.md, section 14).
 
     Reads `descriptors`, and the encoder of the `knowledge` that ships. Writes `encoding`. It is of
-    no point where shape cannot be told.
-    Choices: half precision, whose error is a hundredth of what one point's features differ from the
-      next one's by.
+    no point where there are no descriptors.
+    Choices: half precision, whose error is a hundredth of the difference between points' features.
     """
-    start, descriptors = (
-        read_knowledge(job.inputs["start"]),
-        Descriptors.read(job.inputs["descriptors"]),
-    )
+    start = read_knowledge(job.inputs["start"])
+    descriptors = Descriptors.read(job.inputs["descriptors"])
     torch.set_num_threads(n_threads())
     try:
         inputs = inputs_of(job.inputs["start"], descriptors, start)

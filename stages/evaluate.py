@@ -32,7 +32,7 @@ from chebsplat.stages.measuring.image_quality import (
     figures_as_taken,
     frame_split,
     image_figures,
-    perceptual,
+    load_lpips,
     timing,
 )
 from chebsplat.stages.runtime.command import Job
@@ -42,8 +42,7 @@ log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
-    """Colour and semantics of the exported scene on its protocol's views (docs/method.md, section
-    10).
+    """Measure the exported scene on its protocol's views (docs/method.md, section 10).
 
     Reads `capture`, `scene` and, for the teacher's own figures, `features`. Writes `evaluation`.
     """
@@ -61,11 +60,13 @@ def run(job: Job) -> None:
             "pass those of one scene"
         )
     lpips = (
-        perceptual(Path(settings.lpips_weights).expanduser()) if settings.lpips_weights else None
+        load_lpips(Path(settings.lpips_weights).expanduser()) if settings.lpips_weights else None
     )
     row = {name: view for view, name in enumerate(capture.names)}
-    chosen = capture.is_test if not protocol.ON_TRAINING else ~capture.is_test
-    places = [k for k, name in enumerate(scene.cameras.names) if name in row and chosen[row[name]]]
+    evaluated = capture.is_test if not protocol.ON_TRAINING else ~capture.is_test
+    places = [
+        k for k, name in enumerate(scene.cameras.names) if name in row and evaluated[row[name]]
+    ]
     if capture.loss_mask is not None:
         counted = [k for k in places if capture.loss_mask[row[scene.cameras.names[k]]].any()]
         if hidden := len(places) - len(counted):
@@ -83,14 +84,14 @@ def run(job: Job) -> None:
     pictures: dict[str, Any] = {"truth": np.stack([capture.images[row[name]] for name in names])}
     measured = capture.protocol | {"resolution": "x".join(map(str, capture.size))}
     figures: dict[str, Any] = {"names": names, "protocol": measured, "source": capture.source}
-    shown: dict[str, list[np.ndarray]] = {"renders": []}
+    stacks: dict[str, list[np.ndarray]] = {"renders": []}
     views = evaluated_views(
-        job, renderer, dict(zip(names, cameras, strict=True)), capture, scene, shown
+        job, renderer, dict(zip(names, cameras, strict=True)), capture, scene, stacks
     )
     segmentation = segmented(job, protocol, views, capture, scene, renderer)
-    for _ in views:  # whatever the protocol did not look at
+    for _ in views:  # views that the protocol did not use
         pass
-    pictures |= {name: np.stack(maps) for name, maps in shown.items()}
+    pictures |= {name: np.stack(maps) for name, maps in stacks.items()}
     masks = None if capture.loss_mask is None else [capture.loss_mask[row[name]] for name in names]
     figures["image"] = image_figures(pictures["renders"], pictures["truth"], masks, lpips)
     figures["n_gaussians"] = len(scene.parameters["means"])
@@ -125,27 +126,25 @@ def segmented(
     scene: Scene,
     renderer: SceneRenderer,
 ) -> dict[str, Any] | None:
-    """What the protocol says of the scene's labels, and what matches nothing; None of a scene
-    without semantics.
-    """
+    """Segmentation figures by the protocol, and unmatched labels; None without semantics."""
     if scene.labels is None:
         job.left_out("segmentation", "the scene has no semantics")
         return None
     if protocol.TRUTH == "labels" and (capture.labels is None or capture.class_names is None):
         job.left_out("mIoU", "the capture has no labels to compare with")
         return {}
-    found: dict[str, Any] = protocol.measure(views, task(job, capture, scene, renderer))
-    if found["scene"]["miou"] is None:
-        job.left_out("mIoU", too_little(found["counted"]["miou"]))
-    elif "point_miou" in found["scene"] and found["scene"]["point_miou"] is None:
-        rests = found["counted"]["point_miou"]
+    figures: dict[str, Any] = protocol.measure(views, task(job, capture, scene, renderer))
+    if figures["scene"]["miou"] is None:
+        job.left_out("mIoU", too_little(figures["counted"]["miou"]))
+    elif "point_miou" in figures["scene"] and figures["scene"]["point_miou"] is None:
+        rests = figures["counted"]["point_miou"]
         job.left_out(
             "3D point mIoU",
             too_little(rests) if rests["classes"] else "the capture has no depth with poses",
         )
     if protocol.TRUTH == "labels":
-        found["unmatched"] = unmatched(scene.label_names or [], capture.class_names or [])
-    return found
+        figures["unmatched"] = unmatched(scene.label_names or [], capture.class_names or [])
+    return figures
 
 
 def too_little(rests: dict[str, int]) -> str:
@@ -159,18 +158,16 @@ def too_little(rests: dict[str, int]) -> str:
 
 
 def unmatched(names: list[str], classes: list[str]) -> dict[str, list[str]]:
-    """The scene's labels that no class of the truth is called like, and the classes that no label
-    is; said, too.
-    """
-    found = {"scene": lacking(names, classes), "truth": lacking(classes, names)}
-    if found["truth"]:
+    """Log and return the scene's labels without a true class, and true classes without a label."""
+    absent = {"scene": lacking(names, classes), "truth": lacking(classes, names)}
+    if absent["truth"]:
         log.warning(
             "no label of the scene is called like these classes of the truth: %s",
-            few(found["truth"]),
+            few(absent["truth"]),
         )
-    if found["scene"]:
-        log.info("labels of the scene that the truth has no class for: %s", few(found["scene"]))
-    return {side: some for side, some in found.items() if some}
+    if absent["scene"]:
+        log.info("labels of the scene that the truth has no class for: %s", few(absent["scene"]))
+    return {side: some for side, some in absent.items() if some}
 
 
 def timings(
@@ -192,13 +189,14 @@ def timings(
 
 
 def layout_error(job: Job, scene: Scene, view: View, image: np.ndarray) -> int:
-    """How far the picture of a view u8 [H, W, 3], of the ragged arrays, is from that of scene.ply:
-    grey levels of 255, the largest difference.
+    """Largest difference, grey levels of 255, of a view rendered from scene.ply and `image`.
+
+    Args: image: u8 [H, W, 3], the view rendered from the ragged arrays.
     """
     path, world = job.inputs["scene"], World.read(scene.summary)
     ply = checked(path, read_manifest(path, Scene.SCHEMA), "scene.ply")
-    shown = SceneRenderer(read_ply(ply, world)[0], job.device).render(view)[0]
-    return int(np.abs(shown.astype(int) - image).max())
+    render = SceneRenderer(read_ply(ply, world)[0], job.device).render(view)[0]
+    return int(np.abs(render.astype(int) - image).max())
 
 
 def camera(scene: Scene, index: int) -> View:
@@ -208,15 +206,15 @@ def camera(scene: Scene, index: int) -> View:
     return View(K, pose, cameras.width, cameras.height)
 
 
-def placed(depth: np.ndarray, view: View) -> np.ndarray:
-    """Where in the world the pixels of a view lie, f64 [H, W, 3]; nan where its depth [H, W] is."""
+def unproject_view(depth: np.ndarray, view: View) -> np.ndarray:
+    """World points f64 [H, W, 3] of a view's pixels; nan where its depth [H, W] is."""
     pixels = np.indices(depth.shape).reshape(2, -1).T
     K, pose = (matrix.double().numpy() for matrix in (view.K, view.viewmat))
     return unproject(depth, K, pose, pixels).reshape(*depth.shape, 3)
 
 
 def task(job: Job, capture: Capture, scene: Scene, renderer: SceneRenderer) -> Any:
-    """What a protocol needs beside the views: classes, and features at points of surfaces."""
+    """Input of a protocol beside the views: classes, and features at points of surfaces."""
 
     def at(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         parts = (renderer.means, renderer.quats, renderer.scales, renderer.opacities)
@@ -234,16 +232,12 @@ def evaluated_views(
     cameras: dict[str, View],
     capture: Capture,
     scene: Scene,
-    shown: dict[str, list[np.ndarray]],
+    stacks: dict[str, list[np.ndarray]],
 ) -> Iterator[EvaluatedView]:
-    """Render one view after another; `shown` collects the pictures. Everything is joined on the
-    view's name.
-    """
+    """Render one view after another, joined on its name; append its pictures to `stacks`."""
 
     def as_classes(labels: np.ndarray) -> np.ndarray:
-        """A picture whose labels are numbered as the truth's, -1 where the truth has no such
-        class.
-        """
+        """Labels numbered as the truth's classes, -1 where the truth has no such class."""
         if scene.label_names is None or capture.class_names is None:
             return labels
         return translated(labels, scene.label_names, capture.class_names, -1)
@@ -269,11 +263,11 @@ def evaluated_views(
             pseudo_labels = MapsByName(teacher.names, teacher.pseudo_labels, "labels of a teacher")
     for name, _ in job.progress.track(list(cameras), len(cameras), "evaluate"):
         image, features = renderer.render(cameras[name], with_features=scene.labels is not None)
-        shown["renders"].append(image)
+        stacks["renders"].append(image)
         if features is None or scene.label_embeddings is None:
             continue
         view = EvaluatedView(name, features, decode_labels(features, scene.label_embeddings))
-        shown.setdefault("predicted", []).append(as_classes(view.labels))
+        stacks.setdefault("predicted", []).append(as_classes(view.labels))
         if teachers is not None:
             view.teacher = teachers[name].astype(np.float32)
             if pseudo_labels is None:
@@ -281,10 +275,10 @@ def evaluated_views(
             else:
                 small = pseudo_labels[name]
             view.teacher_labels = resized(small, view.labels.shape)
-            shown.setdefault("teacher", []).append(as_classes(view.teacher_labels))
+            stacks.setdefault("teacher", []).append(as_classes(view.teacher_labels))
         if truths is not None:
             view.truth = truths[name]
             if depths is not None:
-                view.surface = placed(depths[name], cameras[name])
-            shown.setdefault("labels", []).append(view.truth)
+                view.surface = unproject_view(depths[name], cameras[name])
+            stacks.setdefault("labels", []).append(view.truth)
         yield view

@@ -23,9 +23,9 @@ def run(job: Job) -> None:
     Reads `gaussians`, for names of labels `features` and, in place of trained features, `refined`
     or `lifted`. Writes `scene`.
 
-    Choices: Gaussians share the features of a dictionary, of which labels are told, too. One that
-      no training view sees has lifted features of zero: no label, and no part in what a view of
-      the features shows.
+    Choices: Gaussians share the features of a dictionary, which labels also come from. A Gaussian
+      that no training view sees has lifted features of zero: no label, and no part in rendered
+      features.
     """
     gaussians = Gaussians.read(job.inputs["gaussians"])
     if len(gaussians.parameters["means"]) == 0:
@@ -33,11 +33,11 @@ def run(job: Job) -> None:
             "the checkpoint holds no Gaussians; train the scene again with milder pruning"
         )
     order = np.argsort(gaussians.parameters["degrees"], kind="stable")
-    wanted = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN", "degrees")
-    parameters = {name: gaussians.parameters[name][order] for name in wanted}
-    semantic = gaussians.parameters.get("features")
-    given = later_features(job, len(order))
-    semantic = semantic if given is None else given
+    fields = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN", "degrees")
+    parameters = {name: gaussians.parameters[name][order] for name in fields}
+    semantic = later_features(job, len(order))
+    if semantic is None:
+        semantic = gaussians.parameters.get("features")
     labelled: dict[str, Any] = {}
     if semantic is None:
         job.left_out("labels", "the scene was trained without semantics")
@@ -73,9 +73,7 @@ def run(job: Job) -> None:
 
 
 def later_features(job: Job, n: int) -> np.ndarray | None:
-    """Features [n, C] made after training, refined before lifted; None where the trained ones are
-    the scene's.
-    """
+    """Features [n, C] refined, or else lifted, after training; None where neither is an input."""
     records: dict[str, type[Refined | Lifted]] = {"refined": Refined, "lifted": Lifted}
     role = next((role for role in records if role in job.inputs), None)
     if role is None:

@@ -1,6 +1,4 @@
-"""ingest: read a source into a capture; its cameras and colours disturbed where a test asks for
-it.
-"""
+"""ingest: read a source into a capture, with disturbed cameras and colours if settings ask."""
 
 from __future__ import annotations
 
@@ -41,7 +39,7 @@ from chebsplat.stages.sources.common import resolve_source
 
 log = logging.getLogger("chebsplat")
 
-ALONE = ("photos", "video")  # kinds of source whose poses are not known
+ALONE = ("photos", "video")  # kinds of source without poses
 NAMED = 20  # blurred views in a message
 SEED = 0  # of all disturbances: the studies compare trainings on the same ones
 
@@ -86,7 +84,7 @@ def read(
 
 
 def blur_note(fields: dict[str, Any]) -> str:
-    """Which views are far less sharp than the others, in one sentence; nothing where none is."""
+    """Names of views that are far less sharp than the others, in a sentence; "" where none is."""
     images = fields["images"]
     luma = np.array([0.299, 0.587, 0.114], np.float32)
     names = [
@@ -96,39 +94,35 @@ def blur_note(fields: dict[str, Any]) -> str:
     if not names:
         return ""
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    shown = ", ".join(names[:NAMED])
+    listed = ", ".join(names[:NAMED])
     return (
-        f"{len(names)} of {len(images)} views look blurred: {shown}{more}; they are used as "
+        f"{len(names)} of {len(images)} views look blurred: {listed}{more}; they are used as "
         "they are."
     )
 
 
 def every(names: list[str], step: int, offset: int) -> np.ndarray:
-    """bool [V]: names whose index in natural order is `offset` modulo `step`, whatever order they
-    are given in.
+    """bool [V]: names whose index in natural order is `offset` modulo `step`.
 
-    Choices: natural order, which is that of text where numbers are padded; of unpadded names text
-      makes another split.
+    Choices: natural order, which is that of text where numbers are padded.
     """
     order = sorted(range(len(names)), key=lambda k: natural(names[k]))
-    chosen = np.zeros(len(names), bool)
-    chosen[order[offset % step :: step]] = True
-    return chosen
+    is_test = np.zeros(len(names), bool)
+    is_test[order[offset % step :: step]] = True
+    return is_test
 
 
 def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dict[str, Any]]:
-    """Test views by the protocol's rule, bool [V], and the protocol with its parameters, for the
-    record.
+    """Test views by the protocol's rule, bool [V], and the protocol with its parameters.
 
     Args: own: bool [V], the source's own split, or None.
     Raises: ConfigError if the config changes a rule that is part of a protocol's name; DataFailure
-      if it leaves no
-            test or no training view.
+      if it leaves no test or no training view.
     """
     rule = protocols.ALL[settings.protocol]
-    given = {"test_every": settings.test_every, "test_offset": settings.test_offset}
+    requested = {"test_every": settings.test_every, "test_offset": settings.test_offset}
     fixed = {"test_every": rule.TEST_EVERY, "test_offset": rule.TEST_OFFSET}
-    used = {key: fixed[key] if value is None else value for key, value in given.items()}
+    used = {key: fixed[key] if value is None else value for key, value in requested.items()}
     if used != fixed and not rule.ADJUSTABLE:
         raise ConfigError(
             f"ingest.protocol {rule.NAME} tests other views; leave test_every and test_offset away"
@@ -150,40 +144,38 @@ def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dic
     if is_test.all() or not is_test.any():
         raise DataFailure(
             f"of {len(names)} views every one whose index % {step} is {offset} is a test view "
-            "(ingest.test_every, "
-            f"ingest.test_offset): that is {'all' if is_test.any() else 'none'} of them; add "
-            "views or change the rule"
+            "(ingest.test_every, ingest.test_offset): that is "
+            f"{'all' if is_test.any() else 'none'} of them; add views or change the rule"
         )
     return is_test, record | by_index
 
 
 def thinned(fields: dict[str, Any], max_train_views: int | None) -> dict[str, Any]:
-    """Those of a capture's fields that hold a thing a view, with at most so many training views,
-    evenly chosen.
-    """
+    """Per-view fields of a capture with at most `max_train_views` training views, evenly spaced."""
     training = np.flatnonzero(~fields["is_test"])
     if max_train_views is None or len(training) <= max_train_views:
         return {}
-    chosen = training[np.linspace(0, len(training) - 1, max_train_views).round().astype(int)]
-    kept = np.union1d(np.flatnonzero(fields["is_test"]), chosen)
-    held = {name: fields.get(name) for name in ("images", "Ks", "cam_from_world", "is_test", *MAPS)}
+    training = training[np.linspace(0, len(training) - 1, max_train_views).round().astype(int)]
+    rows = np.union1d(np.flatnonzero(fields["is_test"]), training)
+    stacks = {
+        name: fields.get(name) for name in ("images", "Ks", "cam_from_world", "is_test", *MAPS)
+    }
     views = {
-        name: np.asarray(values[:])[kept] for name, values in held.items() if values is not None
+        name: np.asarray(values[:])[rows] for name, values in stacks.items() if values is not None
     }
     if fields.get("tracks") is not None:
         point, row = fields["tracks"].T
-        stays = np.isin(row, kept)
-        views["tracks"] = np.stack([point[stays], np.searchsorted(kept, row[stays])], 1).astype(
+        stays = np.isin(row, rows)
+        views["tracks"] = np.stack([point[stays], np.searchsorted(rows, row[stays])], 1).astype(
             np.int32
         )
-    return views | {"names": [fields["names"][row] for row in kept]}
+    return views | {"names": [fields["names"][row] for row in rows]}
 
 
 def renamed(fields: dict[str, Any], classes: dict[str, list[str]]) -> dict[str, Any]:
-    """Labels [V, H, W] in these classes, -1 where the source's class stands for none, and their
-    names.
+    """Labels [V, H, W] in these classes, -1 of source classes in none, and the classes' names.
 
-    Raises: ConfigError where the source has no labels, or no class of a name that is given.
+    Raises: ConfigError where the source has no labels, or no class of one of the names.
     """
     own, labels = fields.get("class_names"), fields.get("labels")
     if own is None or labels is None:
@@ -200,8 +192,7 @@ def renamed(fields: dict[str, Any], classes: dict[str, list[str]]) -> dict[str, 
 
 
 def run(job: Job) -> None:
-    """Take a source's images, cameras, depth and labels as one capture, and choose the views that
-    are tested.
+    """Read a source's images, cameras, depth and labels into one capture, and split off test views.
 
     Reads a source, of files or generated, and the `model` of photos that come alone. Writes
     `capture`.
@@ -296,11 +287,10 @@ def normalised(fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def recolored(images: np.ndarray, is_test: np.ndarray, stops: float) -> np.ndarray:
-    """Images u8 [V, H, W, 3] with an exposure of ± `stops` and a white balance of ± a quarter of
-    it, by training view.
+    """Images u8 [V, H, W, 3] of random exposures, ± `stops`, and white balances, by training view.
 
-    Choices: linear light is multiplied, by uniform logarithms whose mean over the training views is
-      0; what is too bright is cut off, as a sensor does.
+    Choices: linear light is multiplied, by uniform logarithms (white balance: of a quarter of the
+      range) whose mean over the training views is 0; bright values are clipped, as by a sensor.
     """
     rng, rows = np.random.default_rng(SEED), np.flatnonzero(~is_test)
     logs = rng.uniform(-stops, stops, (len(rows), 1)) + rng.uniform(
@@ -313,11 +303,9 @@ def recolored(images: np.ndarray, is_test: np.ndarray, stops: float) -> np.ndarr
 
 
 def displaced(poses: np.ndarray, is_test: np.ndarray, degrees: float, shift: float) -> np.ndarray:
-    """Poses [V, 4, 4] turned about their centres by `degrees` and shifted by `shift` scene units,
-    by training view.
+    """Poses [V, 4, 4]; each training view turned by `degrees` and shifted by `shift` scene units.
 
-    Choices: directions are random; the mean motion of the world that they amount to is taken out,
-      to first order.
+    Choices: directions are random; their mean, a motion of the world, is removed to first order.
     """
     rng, rows = np.random.default_rng(SEED), np.flatnonzero(~is_test)
     turns, shifts = (rng.normal(size=(len(rows), 3)) for _ in range(2))
@@ -349,7 +337,7 @@ def disturbed(
         )
     if degrees > 0 or shift > 0:
         changed["cam_from_world"] = displaced(fields["cam_from_world"], is_test, degrees, shift)
-        changed["tracks"] = None  # they tell of the poses as they were
+        changed["tracks"] = None  # they are of the original poses
         notes.append(
             f"Poses of the training views are disturbed by {degrees:g}° and {shift:g} scene units."
         )

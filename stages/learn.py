@@ -1,6 +1,4 @@
-"""learn: what a scene teaches about shape, for the scenes after it: sums over its points (Eqs
-14-15).
-"""
+"""learn: a scene's lesson about shape for later scenes: sums over its points (Eqs 14-15)."""
 
 from __future__ import annotations
 
@@ -37,11 +35,11 @@ from chebsplat.stages.shape_models.answers import (
     words_of,
 )
 from chebsplat.stages.shape_models.surfaces import in_scene, swept_Ks
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.teacher_models.text_encoder import match_names
 
 REACH = 0.3  # metres from a label to the described point that it is of
 KIND = {"depth": "held_out", "swept depth": "held_out_swept"}  # of rooms, by kind of surface
-# times the largest novelty of such rooms, which were held out: what is newer is of another kind
+# times the largest novelty of such rooms, held out: a scene above it is new in kind
 KNOWN = 1.05
 VOUCHED = ("labels", "given")  # kinds of teacher that the user answers for
 
@@ -50,10 +48,10 @@ def run(job: Job) -> None:
     """The lesson of a scene, and the evidence by which later scenes trust it.
 
     Reads `capture`, `points`, `descriptors`, `encoding`, `features`, and the `knowledge` that
-    ships, beside whose answers it is judged. Writes `lesson`. It is of nothing where a scene shows
-    too little of a surface.
-    Choices: trust is measured beside what ships, not beside what the lessons before have made of
-      it: so it is the same in whatever order scenes are learned.
+    ships, against which it is judged. Writes `lesson`. It is empty where a scene shows too little
+    of a surface.
+    Choices: trust is measured against what ships, not against what earlier lessons have made of
+      it: so it does not depend on the order in which scenes are learned.
     """
     settings, start = job.config.learn, read_knowledge(job.inputs["start"])
     capture = Capture.read(job.inputs["capture"])
@@ -73,16 +71,18 @@ def run(job: Job) -> None:
             raise DataFailure(encoding.notes["none"])
         if settings.points is not None:
             world = World.read(capture.source)
-            said, n_views, embeddings = labelled(Path(settings.points), start, descriptors, world)
+            meanings, n_views, embeddings = labelled(
+                Path(settings.points), start, descriptors, world
+            )
             notes |= {"given": True, "teacher": "labelled points"}
         else:
-            said, n_views = meant(job, start, capture, points, features, descriptors)
+            meanings, n_views = average_views(job, start, capture, points, features, descriptors)
             embeddings = named_embeddings(job, start, features)
             notes["unnamed"] = unnamed(start, features)
-        labels = decode_labels(said, embeddings)
+        labels = decode_labels(meanings, embeddings)
         weights = odds(n_views, labels)
         in_channels = settings.points is None and of_features(features)
-        words = words_by_label(start, features)[labels] if in_channels else said
+        words = words_by_label(start, features)[labels] if in_channels else meanings
     except DataFailure as error:
         job.left_out("a lesson", str(error))
         p, d = start.map.shape
@@ -94,30 +94,30 @@ def run(job: Job) -> None:
             "labels without a word",
             f"knowledge has no word for {', '.join(notes['unnamed'])}: no vote from shape",
         )
-    sums = summed(z, np.concatenate([said, words], 1), weights)
-    seen, half = n_views >= LEAST_VIEWS, said.shape[1]
+    sums = summed(z, np.concatenate([meanings, words], 1), weights)
+    visible, half = n_views >= LEAST_VIEWS, meanings.shape[1]
     answers = z @ (start.map[:, :half] if in_channels else start.map[:, half:])
     missed = (
         weights
-        @ np.square(answers - said).sum(1)
-        / max(float(weights @ np.square(said).sum(1)), 1e-30)
+        @ np.square(answers - meanings).sum(1)
+        / max(float(weights @ np.square(meanings).sum(1)), 1e-30)
     )
     rho, spread = novelty(sums, start.scale, start.basis), sums.spread()
     notes |= {
-        "n_points": int(seen.sum()),
+        "n_points": int(visible.sum()),
         "n_labels": len(embeddings),
         "rho": rho,
         "sigma": spread,
         "novelty": scaled_novelty(rho, spread),
         "known": KNOWN * start.card["novelty"][KIND[descriptors.notes["of"]]],
-        "familiar": familiar(said[seen], answers[seen], embeddings),
-        "alike": float((decode_labels(answers[seen], embeddings) == labels[seen]).mean()),
+        "familiar": familiar(meanings[visible], answers[visible], embeddings),
+        "alike": float((decode_labels(answers[visible], embeddings) == labels[visible]).mean()),
     }
     job.facts |= notes | {"unexplained": float(missed)}
     write_lesson(job.out, Lesson(sums, notes))
 
 
-def meant(
+def average_views(
     job: Job,
     start: Knowledge,
     capture: Capture,
@@ -125,8 +125,7 @@ def meant(
     features: Features,
     descriptors: Descriptors,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What training views mean by each described point, on average, f64 [N, d], and how
-    many see it [N].
+    """Mean features of the described points over training views, f64 [N, d]; numbers of views [N].
 
     Raises: DataFailure where no training view has a camera and features.
     """
@@ -161,8 +160,8 @@ def meant(
 
 
 def named_embeddings(job: Job, start: Knowledge, features: Features) -> np.ndarray:
-    """What a point's meaning is compared with, f32: the scene's labels in the channels of knowledge
-    [L, d]; where the scene has codes of classes, the words of those that knowledge has a word for.
+    """Embeddings f32 [L, d] of the scene's labels in the channels of knowledge; where the scene has
+    codes of classes, of those that knowledge has a word for.
     """
     if not of_features(features):
         return words_of(job.inputs["start"], start, features)[1]
@@ -172,15 +171,15 @@ def named_embeddings(job: Job, start: Knowledge, features: Features) -> np.ndarr
 def labelled(
     path: Path, start: Knowledge, descriptors: Descriptors, world: World
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a user says of points: the words f32 [N, d] of the described points, zero of the others;
-    n_views, LEAST_VIEWS of those; and the unit embeddings f32 [L, d] of the words.
+    """A user's words for points: embeddings f32 [N, d] of the described points, zero without word;
+    n_views [N], LEAST_VIEWS of those with one; and the unit embeddings f32 [L, d] of the words.
 
     Raises: InputError naming the line that is no point, the word that knowledge lacks, or that
       nothing lies beside.
     Choices: a label is of the described point nearest to it, within REACH.
     """
     where, words = read_labels(path)
-    rows = found(words, start.words)
+    rows = match_names(words, start.words)
     if -1 in rows:
         word = words[rows.index(-1)]
         near = ", ".join(suggest(word, start.words))
@@ -195,18 +194,14 @@ def labelled(
             f"{path}: no point lies within {REACH} m of the scene's surface; give x, "
             "y, z in its frame"
         )
-    said, embeddings = (
-        np.zeros((len(means), start.matrix.shape[1]), np.float32),
-        units(start.embeddings[rows]),
-    )
-    np.add.at(said, nearest[beside], embeddings[beside])
-    return units(said), np.where(said.any(1), LEAST_VIEWS, 0), np.unique(embeddings, axis=0)
+    meanings = np.zeros((len(means), start.matrix.shape[1]), np.float32)
+    embeddings = units(start.embeddings[rows])
+    np.add.at(meanings, nearest[beside], embeddings[beside])
+    return units(meanings), np.where(meanings.any(1), LEAST_VIEWS, 0), np.unique(embeddings, axis=0)
 
 
 def read_labels(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Points f64 [M, 3] and a word each, of a CSV with columns x, y, z, word. Raises InputError
-    naming the line.
-    """
+    """Points f64 [M, 3] and their words, of a CSV with columns x, y, z, word. Raises InputError."""
     where, words = [], []
     with path.open(newline="", encoding="utf-8") as handle:
         for number, row in enumerate(csv.DictReader(handle), start=2):

@@ -1,6 +1,4 @@
-"""lift: what the 2D teacher says of each Gaussian of a trained scene, by one pass over the training
-views.
-"""
+"""lift: the 2D teacher's features on trained Gaussians, by one pass over the training views."""
 
 from __future__ import annotations
 
@@ -14,15 +12,12 @@ from chebsplat.stages.training.truth import labels_right
 
 
 def run(job: Job) -> None:
-    """Lift features to Gaussians, with their evidence, without training (docs/method.md, section
-    12).
+    """Lift features to Gaussians, with their evidence, untrained (docs/method.md, section 12).
 
     Reads `capture`, `gaussians` and `features`. Writes `lifted`.
     """
-    capture, gaussians = (
-        Capture.read(job.inputs["capture"]),
-        Gaussians.read(job.inputs["gaussians"]),
-    )
+    capture = Capture.read(job.inputs["capture"])
+    gaussians = Gaussians.read(job.inputs["gaussians"])
     features = Features.read(job.inputs["features"])
     lifted = lifted_from(
         capture,

@@ -1,4 +1,4 @@
-"""onnx: the encoder of shape and the scene's knowledge as one graph that answers as torch does."""
+"""onnx: the encoder of shape and the scene's knowledge as one graph, equal to torch's."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ from chebsplat.stages.shape_models.point_graph import point_contract, point_mode
 
 ENCODER = "encoder.onnx"
 TOLERANCE = 1e-4  # largest difference from torch
-N_COMPARED = 2048  # points of the scene that both are asked of
+N_COMPARED = 2048  # points of the scene, for the comparison
 
 
 def run(job: Job) -> None:
-    """`encoder.onnx`, which holds the contract of its inputs and outputs (docs/method.md, section
-    14).
+    """`encoder.onnx`, with the contract of its inputs and outputs (docs/method.md, section 14).
 
     Reads `knowledge` and `descriptors`. Writes `encoder`.
     Raises: DataFailure where the graph answers otherwise than torch by more than TOLERANCE.
@@ -45,8 +44,8 @@ def run(job: Job) -> None:
         return
     inputs = first(inputs, N_COMPARED)
     runner = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    wanted, given = [entry.name for entry in runner.get_inputs()], cloud_of(inputs)._asdict()
-    answers = runner.run(None, {name: given[name].numpy() for name in wanted})[0]
+    names, tensors = [entry.name for entry in runner.get_inputs()], cloud_of(inputs)._asdict()
+    answers = runner.run(None, {name: tensors[name].numpy() for name in names})[0]
     difference = float(np.abs(answers - answered(knowledge, inputs)).max())
     if not difference <= TOLERANCE:
         raise DataFailure(

@@ -22,9 +22,9 @@ def run(job: Job) -> None:
 
     Reads photos or a video. Writes `model`.
 
-    Raises:  DataFailure where few photos register, or nothing tells how far away anything is.
-    Choices: all photos take part, those that are tested later, too. A video gives more frames where
-      few of them join.
+    Raises:  DataFailure where few photos register, or their rays fix no depth.
+    Choices: all photos take part, also later test views. Of a video twice the frames are tried
+      where few of them register.
     """
     try:
         best = _best(job)
@@ -48,9 +48,9 @@ def _best(job: Job) -> PhotoModel:
         pictures = job.scratch / f"images-{finer}"
         pictures.mkdir(parents=True, exist_ok=True)
         of.save(shots, folder, pictures, settings.max_side)
-        found = posing.found(job, shots, pictures, settings)
-        if found is not None and (best is None or share(found) > share(best)):
-            best = found
+        model = posing.map_photos(job, shots, pictures, settings)
+        if model is not None and (best is None or share(model) > share(best)):
+            best = model
             best.notes[:0] = notes
         if best is not None and share(best) * posing.MORE >= 1:
             break

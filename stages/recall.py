@@ -1,6 +1,4 @@
-"""recall: what a scene starts from: the encoder that ships, and the map that it and the lessons of
-others give.
-"""
+"""recall: the knowledge that a scene starts from: the shipped encoder, and a map of all lessons."""
 
 from __future__ import annotations
 
@@ -20,14 +18,13 @@ from chebsplat.stages.runtime.command import Job
 
 # share of labels that shape and teacher have alike: below it no trust, above it all
 ALIKE = 0.5, 0.75
-# the same of labels that were given: what is as good as drawn at random is no label of this room
+# the same of labels that the user vouches for: below it they are as good as random
 GIVEN = 0.1, 0.2
 FAMILIAR = 0.4  # the same of how sure the teacher is beside shape (`blend.familiar`), from 0 up
 
 
 def run(job: Job) -> None:
-    """The map of the lessons that a scene is pinned to, each by its trust (docs/method.md, section
-    14).
+    """The map of a scene's pinned lessons, each weighted by its trust (docs/method.md, section 14).
 
     Reads the `knowledge` that ships, and of each such scene its `lesson`. Writes `knowledge`.
     """
@@ -44,9 +41,9 @@ def run(job: Job) -> None:
                 f"{paths[key]} is a lesson of another encoder; learn it again (`chebsplat "
                 "knowledge rebuild`)"
             )
-    knowledge = taught(start, lessons)
-    known = mean_of([Sums(*of) for of in (*start.shipped, *(one.sums for one in lessons.values()))])
-    job.facts["unexplained"] = unexplained(known, knowledge.map.astype(np.float64))
+    knowledge = combine_lessons(start, lessons)
+    sums = mean_of([Sums(*of) for of in (*start.shipped, *(one.sums for one in lessons.values()))])
+    job.facts["unexplained"] = unexplained(sums, knowledge.map.astype(np.float64))
     job.facts |= knowledge.lessons | {
         "n_lessons": len(lessons),
         "encoder": read_manifest(job.inputs["start"]).key,
@@ -54,28 +51,25 @@ def run(job: Job) -> None:
     write_knowledge(job.out, knowledge)
 
 
-def taught(start: Knowledge, lessons: Mapping[str, Lesson]) -> Knowledge:
-    """What ships, and what lessons add, taken in the order of their keys.
+def combine_lessons(start: Knowledge, lessons: Mapping[str, Lesson]) -> Knowledge:
+    """Knowledge solved from the shipped sums and those of lessons, in the order of their keys.
 
-    Choices: the basis grows by lessons that are trusted, and newer in kind than what ships calls
-      known.
+    Choices: the basis grows by lessons that are trusted, and newer in kind than any shipped room.
     """
     shipped = [Sums(*of) for of in start.shipped]
     used = {key: of for key, of in sorted(lessons.items()) if "none" not in of.notes}
-    sums, trust = (
-        [Sums(*of.sums) for of in used.values()],
-        [trusted(of.notes) for of in used.values()],
-    )
+    sums = [Sums(*of.sums) for of in used.values()]
+    trust = [trusted(of.notes) for of in used.values()]
     new = [of.notes["novelty"] > of.notes["known"] for of in used.values()]
     growing = [k for k, weight in enumerate(trust) if new[k] and weight > 0]
-    known = combined(
+    growth = combined(
         [mean_of(shipped), *(sums[k] for k in growing)],
         [1.0, *(trust[k] for k in growing)],
     )
     return dataclasses.replace(
         start,
         map=mapped(shipped, sums, trust).astype(np.float32),
-        basis=basis(known, start.scale).astype(np.float32),
+        basis=basis(growth, start.scale).astype(np.float32),
         shipped=[],
         lessons={
             "of": [
@@ -93,13 +87,12 @@ def taught(start: Knowledge, lessons: Mapping[str, Lesson]) -> Knowledge:
 
 
 def trusted(notes: Mapping[str, Any]) -> float:
-    """How far a lesson is trusted, in [0, 1].
+    """Trust in a lesson, in [0, 1].
 
-    Choices: by the labels that shape and teacher have alike, and by how sure the teacher is beside
-      shape: a teacher out of its depth says the same wrong things from every view, which no
-        agreement of views
-      tells. Fully where the user answers for the labels, unless shape has next to none of them
-      alike.
+    Choices: by the share of labels that shape and teacher agree on, and by how sure the teacher is
+      beside shape: a teacher out of its depth gives the same wrong label in every view, which no
+      agreement of views reveals. 1 where the user answers for the labels, unless shape agrees with
+      next to none of them.
     """
     least, enough = GIVEN if notes["given"] else ALIKE
     alike = float(np.clip((notes["alike"] - least) / (enough - least), 0, 1))
@@ -107,7 +100,7 @@ def trusted(notes: Mapping[str, Any]) -> float:
 
 
 def why(notes: Mapping[str, Any]) -> str:
-    """What a lesson's trust comes from, in words."""
+    """Reason of a lesson's trust, in words."""
     if notes["given"]:
         return f"its labels were given, and shape has {notes['alike']:.0%} of them alike"
     return (

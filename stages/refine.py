@@ -1,6 +1,4 @@
-"""refine: the features of a finished scene, smoothed, and blended with knowledge as far as its
-training views ask.
-"""
+"""refine: smooth the features of a finished scene and blend them with knowledge of shape."""
 
 from __future__ import annotations
 
@@ -40,12 +38,11 @@ REACH = 0.15  # metres from swept points, where an answer is half as long
 
 
 def run(job: Job) -> None:
-    """Smooth the features of trained Gaussians, then blend them with knowledge (docs/method.md,
-    section 13).
+    """Smooth the features of trained Gaussians, blend in knowledge (docs/method.md, section 13).
 
-    Reads `gaussians` and `lifted`, for the scene's unit `capture`, for what knowledge says
-    `knowledge`, `descriptors`, `encoding` and `features`, by which the share of labels that change
-    is counted, too. Writes `refined`.
+    Reads `gaussians` and `lifted`; for the scene's unit `capture`; for knowledge `knowledge`,
+    `descriptors`, `encoding` and `features`, by which the share of labels that change is counted,
+    too. Writes `refined`.
     """
     settings = job.config.refine
     gaussians, lifted = Gaussians.read(job.inputs["gaussians"]), Lifted.read(job.inputs["lifted"])
@@ -62,7 +59,7 @@ def run(job: Job) -> None:
     trained = p.get("features")
     capture = Capture.read(job.inputs["capture"]) if "capture" in job.inputs else None
     started = settings.start
-    # Gaussians that no depth has placed lie where they look right, which lifting asks nothing of
+    # without depth Gaussians may lie off the surface, and lifted features with them
     if started == "auto":
         started = "both" if capture is None or capture.depth is not None else "trained"
     if trained is None:
@@ -74,13 +71,13 @@ def run(job: Job) -> None:
     features = start(started, lifted.features, trained)
     unit, job.facts["unit_from"] = scene_unit(capture, p["means"])
     near = affinities(p["means"], *surface_of(p), unit)
-    knowledge = known(job, p, unit)
+    knowledge = predict_from_shape(job, p, unit)
     choice = calibrate(lifted.halves, lifted.half_views, near, knowledge)
     smoothed = choice.smooth if settings.smooth == "auto" else settings.smooth == "on"
     strength = choice.strength
     known_to_teacher = belief = 1.0
-    made = [features, smooth(features, lifted.n_views, near) if smoothed else features]
-    made.append(made[1])
+    steps = [features, smooth(features, lifted.n_views, near) if smoothed else features]
+    steps.append(steps[1])
     if knowledge is not None:
         embeddings = Features.read(job.inputs["features"]).label_embeddings
         known_to_teacher = familiar(lifted.features, knowledge, embeddings)
@@ -91,8 +88,8 @@ def run(job: Job) -> None:
             * reliable(lifted.halves, lifted.half_views)
             * known_to_teacher
         )
-        blended = blend(made[1], evidence, knowledge, strength)
-        made[2] = (
+        blended = blend(steps[1], evidence, knowledge, strength)
+        steps[2] = (
             smooth(blended, evidence + trusted(knowledge, strength), near) if smoothed else blended
         )
     curve = {
@@ -101,27 +98,29 @@ def run(job: Job) -> None:
     notes = {"start": started, "smooth": smoothed, "strength": strength, "curve": curve}
     notes |= {"familiar": known_to_teacher, "believed": belief}
     sure = confidence(
-        made[1], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher
+        steps[1], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher
     )
-    Refined(made[2], sure, notes).write(job.out)
+    Refined(steps[2], sure, notes).write(job.out)
     of_strength = choice.curve["on" if smoothed else "off"]
     agree = float(np.interp(strength, list(of_strength), list(of_strength.values())))
     job.facts |= {"halves_agree": agree, "gain": agree - choice.curve["off"][0.0]}
     if capture is not None and "features" in job.inputs:
         job.facts["right"] = labels_right(
-            capture, p, made[2], Features.read(job.inputs["features"])
+            capture, p, steps[2], Features.read(job.inputs["features"])
         )
-    job.facts |= {"n_gaussians": len(features), "unit": unit, **notes} | shares(job, made)
+    job.facts |= {"n_gaussians": len(features), "unit": unit, **notes} | shares(job, steps)
 
 
-def known(job: Job, parameters: dict[str, np.ndarray], unit: float) -> np.ndarray | None:
-    """What knowledge of shape says of the Gaussians, f32 [N, C], by the described points beside
-    them; None where the scene has no knowledge, or none of it reaches the scene.
+def predict_from_shape(
+    job: Job, parameters: dict[str, np.ndarray], unit: float
+) -> np.ndarray | None:
+    """Features of the Gaussians f32 [N, C] that knowledge predicts from the shape at the described
+    points beside them; None where the scene has no knowledge, or none of it applies.
 
     Args: parameters: of the Gaussians; unit: scene units in a metre.
     Raises: ConfigError where an input that knowledge needs is missing.
-    Choices: where a sweep found the points, an answer's length, by which it counts, falls with the
-      distance to them: what no photo's depth shows is the views' to tell.
+    Choices: the length of a prediction is its weight. It falls with the distance to swept points:
+      where no photo has depth, the views decide.
     """
     if "knowledge" not in job.inputs:
         return None
@@ -131,10 +130,8 @@ def known(job: Job, parameters: dict[str, np.ndarray], unit: float) -> np.ndarra
         raise ConfigError(
             f"knowledge is of described points and a teacher; pass --in-{absent[0]}, too"
         )
-    descriptors, encoding = (
-        Descriptors.read(job.inputs["descriptors"]),
-        Encoding.read(job.inputs["encoding"]),
-    )
+    descriptors = Descriptors.read(job.inputs["descriptors"])
+    encoding = Encoding.read(job.inputs["encoding"])
     if not len(encoding.features):
         job.left_out("knowledge of shape", encoding.notes["none"])
         return None
@@ -164,16 +161,16 @@ def known(job: Job, parameters: dict[str, np.ndarray], unit: float) -> np.ndarra
     return carried
 
 
-def shares(job: Job, made: list[np.ndarray]) -> dict[str, Any]:
+def shares(job: Job, steps: list[np.ndarray]) -> dict[str, Any]:
     """Share of the Gaussians whose label smoothing changes, and knowledge after it."""
     if "features" not in job.inputs:
         return {}
     embeddings = Features.read(job.inputs["features"]).label_embeddings
-    if embeddings.shape[1] != made[0].shape[1]:
+    if embeddings.shape[1] != steps[0].shape[1]:
         raise InputError(
             f"{job.inputs['features']} has other channels than the checkpoint; pass its own"
         )
-    labels = [decode_labels(features, embeddings) for features in made]
+    labels = [decode_labels(features, embeddings) for features in steps]
     names = ("changed_by_smoothing", "changed_by_knowledge")
     return {
         name: float((a != b).mean()) for name, a, b in zip(names, labels, labels[1:], strict=False)

@@ -1,6 +1,4 @@
-"""The stages and what each reads: the one table behind the commands, the planner and the
-Snakefile.
-"""
+"""Table of the stages and their inputs, for the commands, the planner and the Snakefile."""
 
 from __future__ import annotations
 
@@ -31,28 +29,26 @@ class Stage:
     optional: tuple[tuple[str, str], ...] = ()
     help: str = ""
 
-    of_scene: bool = True  # false: never a part of a scene's run, only what such a run is given
+    of_scene: bool = True  # false: never a part of a scene's run, only an input of one
     # stages of the scene that come first, although nothing of theirs is read
     after: tuple[str, ...] = ()
-    # computes on a GPU where one is used, to other bytes than the CPU's: the key says so then
+    # runs on a GPU where one is used, to other bytes than the CPU's: the device is in the key then
     on_device: bool = False
-    device_packages: tuple[str, ...] = ()  # what it computes with there
+    device_packages: tuple[str, ...] = ()  # that it uses there
 
     def schemas(self, roles: Iterable[str]) -> dict[str, str]:
-        """What each role of an input must be of; of `lesson-KEY`, one of many, what `lesson` is.
+        """Schema of the input of each role; `lesson-KEY`, one of many, has that of `lesson`.
 
         Raises: KeyError on a role that the stage has not.
         """
         return {role: STAGES[self.roles[role.partition("-")[0]]].schema for role in roles}
 
-    def device(self, wanted: str, sections: Mapping[str, Any]) -> str:
-        """What computes it, where `wanted` is there: that, or the CPU, where its settings make no
-        use of a GPU.
-        """
+    def device(self, requested: str, sections: Mapping[str, Any]) -> str:
+        """The device it runs on: `requested`, or the CPU where its settings need no GPU."""
         idle = self.name == "teacher" and sections["teacher"]["kind"] in MODEL_FREE
         # plain torch and SciPy
         idle = idle or (self.name == "train" and sections["train"]["method"] == "printed")
-        return wanted if self.on_device and not idle else "cpu"
+        return requested if self.on_device and not idle else "cpu"
 
     @property
     def roles(self) -> dict[str, str]:
@@ -64,7 +60,8 @@ STAGES: dict[str, Stage] = {
     for stage in (
         Stage("pose", "chebsplat.model/1", ("source", "pose"),
               help="Cameras and poses of photos or a video that come alone."),
-        Stage("ingest", "chebsplat.capture/2", ("scene", "source", "ingest"), optional=(("model", "pose"),),
+        Stage("ingest", "chebsplat.capture/2", ("scene", "source", "ingest"),
+              optional=(("model", "pose"),),
               help="Read a source into a capture: images, cameras and, where given, depth and "
                    "labels."),
         Stage("sfm", "chebsplat.points/2", ("sfm",), (("capture", "ingest"),),
@@ -72,29 +69,32 @@ STAGES: dict[str, Stage] = {
         Stage("channels", "chebsplat.channels/2", ("channels",),
               help="From a teacher's channels to the fewer that all scenes are trained in."),
         Stage("teacher", "chebsplat.features/2", ("teacher",), (("capture", "ingest"),),
-              (("channels", "channels"),), on_device=True, help="Per-view semantic features of a 2D "
-                                                                ""
-                                                                ""
-                                                                "teacher."),
+              (("channels", "channels"),), on_device=True,
+              help="Per-view semantic features of a 2D teacher."),
         Stage("agree", "chebsplat.agreement/2", ("agree",),
               (("capture", "ingest"), ("points", "sfm"), ("features", "teacher")),
               help="How far views agree on what the same points are: whether the teacher knows "
                    "the scene."),
-        Stage("teach", "chebsplat.knowledge/2", ("teach",), (("channels", "channels"),), of_scene=False,
+        Stage("teach", "chebsplat.knowledge/2", ("teach",), (("channels", "channels"),),
+              of_scene=False,
               help="The encoder of shape that scenes start from, taught over generated rooms."),
-        Stage("describe", "chebsplat.descriptors/2", ("describe",), (("capture", "ingest"), ("points", "sfm")),
-              help="Anisotropic Chebyshev descriptors of the surface's points at four radii (Eqs "
-                   "1-6)."),
-        Stage("encode", "chebsplat.encoding/1", (), (("descriptors", "describe"), ("start", "teach")),
-              help="Features of the shape about each point, by the knowledge's transformers (Eq 7)."),
+        Stage("describe", "chebsplat.descriptors/2", ("describe",),
+              (("capture", "ingest"), ("points", "sfm")),
+              help="Anisotropic Chebyshev descriptors of the surface's points at four radii "
+                   "(Eqs 1-6)."),
+        Stage("encode", "chebsplat.encoding/1", (),
+              (("descriptors", "describe"), ("start", "teach")),
+              help="Features of the shape about each point, by the knowledge's transformers "
+                   "(Eq 7)."),
         Stage("learn", "chebsplat.lesson/1", ("scene", "learn"),
-              (("capture", "ingest"), ("points", "sfm"), ("descriptors", "describe"), ("encoding", "encode"),
-               ("features", "teacher"), ("start", "teach")),
+              (("capture", "ingest"), ("points", "sfm"), ("descriptors", "describe"),
+               ("encoding", "encode"), ("features", "teacher"), ("start", "teach")),
               help="What the scene teaches about shape, for the scenes after it."),
         Stage("recall", "chebsplat.knowledge/2", (), (("start", "teach"),), (("lesson", "learn"),),
               help="What the scene starts from: what ships, and the lessons that it is pinned to "
                    "(Eqs 14-15)."),
-        Stage("onnx", "chebsplat.encoder/3", (), (("knowledge", "recall"), ("descriptors", "describe")),
+        Stage("onnx", "chebsplat.encoder/3", (),
+              (("knowledge", "recall"), ("descriptors", "describe")),
               help="The encoder of shape and the scene's knowledge as one ONNX graph, compared "
                    "with torch."),
         Stage("train", "chebsplat.gaussians/2", ("describe", "train"),
@@ -105,23 +105,27 @@ STAGES: dict[str, Stage] = {
               (("capture", "ingest"), ("gaussians", "train"), ("features", "teacher")),
               help="Features of the teacher on trained Gaussians, and how much the views agree, "
                    "without training."),
-        Stage("refine", "chebsplat.refined/2", ("refine",), (("gaussians", "train"), ("lifted", "lift")),
-              (("capture", "ingest"), ("descriptors", "describe"), ("encoding", "encode"), ("features", "teacher"),
-               ("knowledge", "recall")),
+        Stage("refine", "chebsplat.refined/2", ("refine",),
+              (("gaussians", "train"), ("lifted", "lift")),
+              (("capture", "ingest"), ("descriptors", "describe"), ("encoding", "encode"),
+               ("features", "teacher"), ("knowledge", "recall")),
               help="Smooth the features of a finished scene and blend them with knowledge, as its "
                    "training views ask."),
         Stage("export", "chebsplat.scene/4", (), (("gaussians", "train"),),
               (("features", "teacher"), ("lifted", "lift"), ("refined", "refine")),
               help="Write PLY and SPZ, ragged zarr, the label dictionary and the summary."),
-        Stage("evaluate", "chebsplat.evaluation/2", ("evaluate",), (("capture", "ingest"), ("scene", "export")),
+        Stage("evaluate", "chebsplat.evaluation/2", ("evaluate",),
+              (("capture", "ingest"), ("scene", "export")),
               (("features", "teacher"),), on_device=True, device_packages=("gsplat",),
               help="Measure the exported scene on the test views."),
-        Stage("report", "chebsplat.report/1", (), (("evaluation", "evaluate"), ("gaussians", "train")),
-              (("model", "pose"), ("capture", "ingest"), ("points", "sfm"), ("channels", "channels"),
-               ("features", "teacher"),
-               ("agreement", "agree"), ("descriptors", "describe"), ("encoding", "encode"), ("learned", "learn"),
-               ("knowledge", "recall"), ("encoder", "onnx"), ("lifted", "lift"), ("refined", "refine"),
-               ("scene", "export")),
-              help="One self-contained HTML page with pictures, tables and error against run time."),
+        Stage("report", "chebsplat.report/1", (),
+              (("evaluation", "evaluate"), ("gaussians", "train")),
+              (("model", "pose"), ("capture", "ingest"), ("points", "sfm"),
+               ("channels", "channels"), ("features", "teacher"), ("agreement", "agree"),
+               ("descriptors", "describe"), ("encoding", "encode"), ("learned", "learn"),
+               ("knowledge", "recall"), ("encoder", "onnx"), ("lifted", "lift"),
+               ("refined", "refine"), ("scene", "export")),
+              help="One self-contained HTML page with pictures, tables and error against "
+                   "run time."),
     )
 }  # fmt: skip

@@ -1,6 +1,4 @@
-"""report: one self-contained HTML page with pictures, tables and error against run time, and the
-figures as CSV.
-"""
+"""report: one self-contained HTML page of pictures, tables and error against run time; CSV, too."""
 
 from __future__ import annotations
 
@@ -8,7 +6,7 @@ import csv
 import json
 import shlex
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -54,17 +52,48 @@ BYTES = {
     "semantic": "semantic arrays, beside either",
     "spz": "scene.spz, lossy",
 }
-# of layouts that hold less than plain 3DGS a share is told
+# layouts whose share of plain 3DGS is reported
 SMALLER = ("ragged", "spz")
 FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 
 
-def run(job: Job) -> None:
-    """One HTML page, and the figures as CSV, of what was measured and where it comes from.
+class Figure(NamedTuple):
+    """A row of the table of figures.
 
-    Reads `evaluation` and `gaussians`, and of `model`, `capture`, `points`, `channels`, `features`,
-    `agreement`, `descriptors`, `encoding`, `lesson`, `knowledge`, `encoder`, `lifted`, `refined`
-    and `scene` what there is. Writes `report`.
+    name: with the unit. scene, teacher: a number, several by what each is of, None where it was not
+      measured, "" where there is none. form: of a number on the page; words: instead of it there.
+    """
+
+    name: str
+    scene: Any
+    teacher: Any = ""
+    form: str = "{:,}"
+    words: str = ""
+
+    def on_page(self) -> tuple[str, str, str]:
+        """Name, scene and teacher as people read them."""
+        if isinstance(self.scene, dict):
+            values = " / ".join(self.form.format(value) for value in self.scene.values())
+            return f"{self.name} {' / '.join(map(str, self.scene))}", values, ""
+        scene, teacher = (
+            value if value == "" else "not measured" if value is None else self.form.format(value)
+            for value in (self.scene, self.teacher)
+        )
+        return self.name, self.words or scene, teacher
+
+    def in_table(self) -> list[list[Any]]:
+        """Rows of a CSV, numbers as numbers and nothing where there is none."""
+        if isinstance(self.scene, dict):
+            return [[f"{self.name} {of}", value, ""] for of, value in self.scene.items()]
+        return [[self.name, self.scene, self.teacher]]
+
+
+def run(job: Job) -> None:
+    """One HTML page, and the figures as CSV, of a scene's measurements and their origin.
+
+    Reads `evaluation` and `gaussians`, and, where there are, `model`, `capture`, `points`,
+    `channels`, `features`, `agreement`, `descriptors`, `encoding`, `lesson`, `knowledge`,
+    `encoder`, `lifted`, `refined` and `scene`. Writes `report`.
     """
     evaluation = Evaluation.read(job.inputs["evaluation"])
     gaussians = Gaussians.read(job.inputs["gaussians"])
@@ -74,11 +103,9 @@ def run(job: Job) -> None:
         )
     manifests = {role: read_manifest(job.inputs[role]) for role in STAGE_OF if role in job.inputs}
     if "knowledge" in manifests and manifests["knowledge"].stage != STAGE_OF["knowledge"]:
-        del manifests["knowledge"]  # it ships, or was given: no stage of this scene has made it
-    facts, figures = (
-        {role: manifest.facts for role, manifest in manifests.items()},
-        evaluation.figures,
-    )
+        del manifests["knowledge"]  # it ships, or is the user's: no stage of this scene has made it
+    facts = {role: manifest.facts for role, manifest in manifests.items()}
+    figures = evaluation.figures
     left_out = absent_stages(job, gaussians) | figures["left_out"]
     for of_input in facts.values():
         left_out |= of_input.get("left_out", {})
@@ -95,7 +122,8 @@ def run(job: Job) -> None:
         facts.get("refined")
     )
     rows += agreement_rows(facts.get("agreement")) + clock_rows(manifests["gaussians"])
-    write_table(job.out / "figures.csv", rows)
+    table = [row for figure in rows for row in figure.in_table()]
+    write_table(job.out / "figures.csv", [["figure", "scene", "2D teacher"], *table])
     write_table(
         job.out / "trace.csv",
         [list(gaussians.trace[0]), *(list(row.values()) for row in gaussians.trace)],
@@ -114,7 +142,7 @@ def run(job: Job) -> None:
         protocol=figures["protocol"],
         teacher=teacher_words(facts["features"]) if "features" in facts else None,
         doubt=facts.get("agreement", {}).get("doubt"),
-        rows=rows[1:],
+        rows=[figure.on_page() for figure in rows],
         tiles=parts.tiles(figures, gaussians),
         legend=parts.legend(pixels, names, colors),
         classes=parts.class_rows(figures, colors),
@@ -131,7 +159,9 @@ def run(job: Job) -> None:
         left_out=sorted(left_out.items()),
         decided=decided_rows(facts["gaussians"]),
         started=started(job.inputs, facts),
-        posed=posed(PhotoModel.read(job.inputs["model"])) if "model" in job.inputs else None,
+        posed=describe_poses(PhotoModel.read(job.inputs["model"]))
+        if "model" in job.inputs
+        else None,
         versions=sorted(versions.items()),
         code=next((m.code for m in manifests.values() if "commit" in m.code), None),
         settings=json.dumps(settings, indent=1, sort_keys=True),
@@ -143,19 +173,15 @@ def run(job: Job) -> None:
 
 
 def psnr_of_one_color(evaluation: Evaluation) -> float:
-    """PSNR, dB, of some evaluated photos, if each pixel had their mean colour: what a scene shows
-    before training.
-    """
+    """PSNR, dB, of some evaluated photos against their mean colour: that of an untrained scene."""
     truth = evaluation.pictures["truth"]
     photos = np.stack([truth[k] for k in range(0, len(truth), -(-len(truth) // N_PICTURES))])
     flat = np.broadcast_to(photos.mean((0, 1, 2)).round().astype(np.uint8), photos.shape)
     return min(psnr(flat, photos), 100.0)
 
 
-def clock_rows(training: Manifest) -> list[list[str]]:
-    """(figure, scene, teacher) of a training that the clock limits: how far it came depends on the
-    machine.
-    """
+def clock_rows(training: Manifest) -> list[Figure]:
+    """Steps of a training by the clock, which depend on the machine."""
     seconds = training.config.get("train", {}).get("seconds")
     if seconds is None:
         return []
@@ -163,13 +189,11 @@ def clock_rows(training: Manifest) -> list[list[str]]:
         f"steps within {seconds:g} s by the clock (train.seconds, measured on "
         f"{measured_on(training)})"
     )
-    return [[what, f"{training.facts['steps']:,}", ""]]
+    return [Figure(what, training.facts["steps"])]
 
 
-def posed(model: PhotoModel) -> dict[str, Any]:
-    """Where photos that came alone were taken, in a sentence and a picture, and what is doubtful
-    about it.
-    """
+def describe_poses(model: PhotoModel) -> dict[str, Any]:
+    """Poses of photos that came alone, in a sentence and a picture, and doubts about them."""
     point, view = model.tracks.T
     counts = np.bincount(view, minlength=len(model.names))
     errors = np.bincount(view, model.errors[point], len(model.names)) / np.maximum(counts, 1)
@@ -179,17 +203,16 @@ def posed(model: PhotoModel) -> dict[str, Any]:
 
 
 def decided_rows(facts: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Settings that the training's config left open: name, value, and what decided it."""
-    words = {name: of["value"] for name, of in facts.get("decided", {}).items()}
-    shown = {
-        name: f"{value:.3g}" if isinstance(value, float) else str(value)
-        for name, value in words.items()
-    }
-    return [(f"train.{name}", value, facts["decided"][name]["by"]) for name, value in shown.items()]
+    """Settings that the training's config left open: name, value, and reason."""
+    return [
+        (f"train.{name}", f"{value:.3g}" if isinstance(value, float) else str(value), of["by"])
+        for name, of in facts.get("decided", {}).items()
+        for value in [of["value"]]
+    ]
 
 
 def teacher_words(facts: dict[str, Any]) -> tuple[str, str]:
-    """(name, in a few words what it is) of the 2D teacher."""
+    """(name, kind in a few words) of the 2D teacher."""
     convention = facts["convention"]
     if facts["kind"] == "labels":
         return "noisy labels", (
@@ -227,54 +250,52 @@ def summary_rows(
     by_degree: list[int] | None,
     trained: dict[str, Any],
     timed: dict[str, str],
-) -> list[list[str]]:
-    """Header, then (figure, scene, teacher). What was not measured says so.
+) -> list[Figure]:
+    """Figures of the evaluation and the training.
 
     Args: by_degree: Gaussians by SH degree, None where unknown; trained: facts of the training;
       timed: the machines that `evaluation` and training (`gaussians`) were measured on.
     """
-
-    def shown(value: float | None, form: str) -> str:
-        return "not measured" if value is None else form.format(value)
-
     image = figures["image"]
     of = ", of undistorted photos" if "undistorted" in figures["source"] else ""
     rows = [
-        ["figure", "scene", "2D teacher"],
-        [f"PSNR, dB (8-bit, mean over views{of})", f"{image['psnr']:.2f}", ""],
-        ["PSNR after a colour fit by view, dB", shown(image.get("psnr_fit"), "{:.2f}"), ""],
+        Figure(f"PSNR, dB (8-bit, mean over views{of})", image["psnr"], form="{:.2f}"),
+        Figure("PSNR after a colour fit by view, dB", image.get("psnr_fit"), form="{:.2f}"),
         *taken_rows(image.get("as_taken")),
-        ["SSIM (window 11, σ 1.5)", f"{image['ssim']:.4f}", ""],
-        ["LPIPS (vgg, images in [0, 1])", shown(figures["lpips"], "{:.3f}"), ""],
+        Figure("SSIM (window 11, σ 1.5)", image["ssim"], form="{:.4f}"),
+        Figure("LPIPS (vgg, images in [0, 1])", figures["lpips"], form="{:.3f}"),
     ]
     segmentation = figures.get("segmentation") or {}
-    names = {"miou": "mIoU", "macc": "mAcc", "oa": "OA", "boundary_miou": "mIoU in the boundary "
-                                                                          "band",
-             "rarest_miou": "mIoU of the five rarest classes", "point_miou": "mIoU of 3D points"}  # fmt: skip
+    names = {
+        "miou": "mIoU",
+        "macc": "mAcc",
+        "oa": "OA",
+        "boundary_miou": "mIoU in the boundary band",
+        "rarest_miou": "mIoU of the five rarest classes",
+        "point_miou": "mIoU of 3D points",
+    }
     for key, name in names.items():
         if key in segmentation.get("scene", {}):
             teacher = segmentation.get("teacher")
-            values = [segmentation["scene"][key], teacher[key] if teacher else None]
             of_truth = f" ({words})" if (words := rests(segmentation, key)) else ""
             rows.append(
-                [
-                    name + of_truth,
-                    shown(values[0], "{:.1%}"),
-                    shown(values[1], "{:.1%}") if teacher else "",
-                ]
+                Figure(
+                    f"{name}, %{of_truth}",
+                    percent(segmentation["scene"][key]),
+                    percent(teacher[key]) if teacher else "",
+                    "{:.1f}",
+                )
             )
-    rows.append(["Gaussians", f"{figures['n_gaussians']:,}", ""])
+    rows.append(Figure("Gaussians", figures["n_gaussians"]))
     if by_degree is not None:
-        rows.append(
-            ["Gaussians of SH degree 0, 1, 2, 3", " / ".join(f"{n:,}" for n in by_degree), ""]
-        )
+        rows.append(Figure("Gaussians of SH degree", dict(enumerate(by_degree))))
     whole = figures["bytes"]["unpruned_ply"]
     for name, size in figures["bytes"].items():
-        share = f" ({size / whole:.0%} of plain 3DGS)" if name in SMALLER else ""
-        rows.append([f"bytes, {BYTES[name]}", f"{size:,}{share}", ""])
+        share = f"{size:,} ({size / whole:.0%} of plain 3DGS)" if name in SMALLER else ""
+        rows.append(Figure(f"bytes, {BYTES[name]}", size, words=share))
     on = f"measured on {timed['evaluation']}"
     rows += [
-        [f"frames/s, {FRAMES[name]} ({on})", f"{v:.1f}", ""]
+        Figure(f"frames/s, {FRAMES[name]} ({on})", v, form="{:.1f}")
         for name, v in figures["frames_per_second"].items()
     ]
     if split := figures["milliseconds"]:
@@ -282,65 +303,65 @@ def summary_rows(
         under = f"{split['width']}x{split['height']}, {threads}, {split['device']}, {on}"
         parts = {"projection": "projection", "sh": "SH", "sort": "sort", "blend": "blend"}
         rows += [
-            [f"ms a frame, {name} ({under})", f"{split[part]:.2f}", ""]
+            Figure(f"ms a frame, {name} ({under})", split[part], form="{:.2f}")
             for part, name in parts.items()
         ]
     on = f"measured on {timed['gaussians']}"
     rows += [
-        [f"ms a training step, {part} ({on})", f"{v:.2f}", ""]
+        Figure(f"ms a training step, {part} ({on})", v, form="{:.2f}")
         for part, v in trained["milliseconds"].items()
     ]
     if peak := trained.get("peak_device_bytes"):
-        rows.append(["bytes of the GPU's memory in training, at most", f"{peak:,}", ""])
+        rows.append(Figure("bytes of the GPU's memory in training, at most", peak))
     return rows
 
 
-def taken_rows(taken: dict[str, Any] | None) -> list[list[str]]:
-    """Figures on the test photos as they were taken; none where these are what was trained on."""
-    if taken is None:
+def percent(share: float | None) -> float | None:
+    """A share in hundredths; None where it was not measured."""
+    return None if share is None else 100 * share
+
+
+def taken_rows(figures: dict[str, Any] | None) -> list[Figure]:
+    """Figures on the test photos as taken; none where these are the test views."""
+    if figures is None:
         return []
-    size = "{}×{}".format(*taken["size"])
+    size = "{}×{}".format(*figures["size"])
     return [
-        [f"PSNR on the photos as taken, {size} pixels, dB", f"{taken['psnr']:.2f}", ""],
-        ["SSIM on them", f"{taken['ssim']:.4f}", ""],
+        Figure(f"PSNR on the photos as taken, {size} pixels, dB", figures["psnr"], form="{:.2f}"),
+        Figure("SSIM on them", figures["ssim"], form="{:.4f}"),
     ]
 
 
-def refined_rows(facts: dict[str, Any] | None) -> list[list[str]]:
-    """(figure, scene, teacher) of how the features were refined: what was chosen, and the
-    agreements it rests on.
-    """
+def refined_rows(facts: dict[str, Any] | None) -> list[Figure]:
+    """Refined features: the choices, and the agreements behind them."""
     if facts is None:
         return []
-    changed = {name: facts.get(f"changed_by_{name}") for name in ("smoothing", "knowledge")}
-    words = {
-        name: "" if share is None else f", {share:.1%} of the labels changed"
-        for name, share in changed.items()
-    }
     counts = f"counts as {facts['strength']:g} views" if facts["strength"] else "none"
     if (familiar := facts.get("familiar", 1.0)) < 1:
         counts += f"; the teacher is unsure of this scene, its views count for {familiar:.2f}"
+    smooth = bool(facts["smooth"])
     rows = [
-        ["smoothing of features", ("on" if facts["smooth"] else "off") + words["smoothing"], ""],
-        ["knowledge in features", counts + words["knowledge"], ""],
+        Figure("smoothing of features (1: on)", int(smooth), words="on" if smooth else "off"),
+        Figure("knowledge in features, views that it counts as", facts["strength"], words=counts),
     ]
-    for name, curve in facts["curve"].items():
-        shown = " / ".join(f"{value:.4f}" for value in curve.values())
-        rows.append([f"agreement of half the training views with the other, smoothing {name}, at "
-                     "k = "
-                     + " / ".join(curve), shown, ""])  # fmt: skip
-    return rows
+    rows += [
+        Figure(f"labels changed by {name}, %", percent(share), form="{:.1f}")
+        for name in ("smoothing", "knowledge")
+        if (share := facts.get(f"changed_by_{name}")) is not None
+    ]
+    half = "agreement of half the training views with the other, smoothing"
+    return rows + [
+        Figure(f"{half} {name}, at k =", curve, form="{:.4f}")
+        for name, curve in facts["curve"].items()
+    ]
 
 
-def agreement_rows(facts: dict[str, Any] | None) -> list[list[str]]:
-    """(figure, scene, teacher) of how far views agree on what points are by their 2D teacher."""
+def agreement_rows(facts: dict[str, Any] | None) -> list[Figure]:
+    """The views' agreement on labels of points by their 2D teacher."""
     if facts is None:
         return []
-    value, count = facts["agreement"], facts["n_points"]
-    shown = "not measured" if value is None else f"{value:.2f}"
-    return [
-        [f"agreement of views on labels of {count:,} points (1: always, 0: by chance)", "", shown]
-    ]
+    name = f"agreement of views on labels of {facts['n_points']:,} points (1: always, 0: by chance)"
+    return [Figure(name, "", facts["agreement"], "{:.2f}")]
 
 
 def write_table(path: Path, rows: list[list[Any]]) -> None:

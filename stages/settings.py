@@ -1,5 +1,4 @@
-"""Every setting of every stage: default, range and meaning. Values are part of an artifact's key;
-this code is not.
+"""Settings of the stages: default, range and meaning. Values are part of a key, this code is not.
 
 Those of descriptor and training are in `chebsplat/settings.py`, where the maths reads them.
 """
@@ -14,7 +13,7 @@ from chebsplat.formats.names import unprintable
 from chebsplat.settings import Section, number, seed, setting
 
 MAX_CHANNELS = 64  # that can be rendered
-SIDES = {  # pixels: the longest side that a protocol's views have, as its module says
+SIDES = {  # pixels: the longest side of a protocol's views
     "labels": 640,
     "replica-f3": 640,
     "replica-gt": 640,
@@ -39,9 +38,7 @@ class SceneSection(Section):
 
 
 class SourceSection(Section):
-    """Where the photos come from. `named` is Replica's scene when REPLICA_ROOT has it, else the
-    generated one.
-    """
+    """Origin of the photos. `named`: Replica's scene if REPLICA_ROOT has it, else generated."""
 
     kind: Literal[
         "named",
@@ -96,7 +93,7 @@ class IngestSection(Section):
         None,
         "JSON of named volumes, which label what depth shows; default: the source's own labels",
     )
-    # for studies: what real cameras do, of known strength, to the training views alone
+    # for studies: errors of real cameras, of known strength, on the training views alone
     disturb_colors: float = number(
         0.0, "exposures at random, in stops; a quarter of it in white balance", 0, 8
     )
@@ -167,11 +164,9 @@ class SfmSection(Section):
 
 
 class TeacherSection(Section):
-    """`auto`: the ONNX model if one is given, otherwise the embedded teacher, but none for
-    photographs without labels;
-    `embedded`: the embedded teacher for these, too; `labels`: the noisy-labels teacher; `given`:
-      pseudo labels with a
-    confidence that the source brings (Panoptic Lifting's ScanNet).
+    """The 2D teacher. `auto`: the ONNX model if one is named, otherwise the embedded teacher, but
+    none for photographs without labels; `embedded`: for these, too; `labels`: the noisy-labels
+    teacher; `given`: pseudo labels with a confidence in the source (Panoptic Lifting's ScanNet).
     """
 
     kind: Literal["auto", "embedded", "labels", "given", "onnx", "none"] = setting(
@@ -210,10 +205,10 @@ class TeacherSection(Section):
 
 
 class ChannelsSection(Section):
-    """What a teacher's channels are reduced to, for all scenes alike.
+    """Reduction of a teacher's channels, for all scenes alike.
 
-    Choices: at most 32 channels. The embedded teacher's features span fewer (the artifact's facts
-      say how many) and lose nothing. Of 512 channels stood in for LSeg's 32 keep 99.8 % of the
+    Choices: at most 32 channels. The embedded teacher's features span fewer (the number is in
+      the artifact's facts) and lose nothing. Of 512 channels like LSeg's 32 keep 99.8 % of the
       decisions between 150 words where the spectrum falls as k^-3 and 95 % where it falls as k^-1;
       13 keep 98 and 77 %. 48 are needed for 1 % relative error in the first case; in the second no
       57 channels, the most that 20 MB a view hold, come below 18 %.
@@ -249,7 +244,7 @@ class LiftSection(Section):
 
     Choices: by agreement with a fifth of the training views that was held out (office0, noisy
       labels, 70 views): 42.8 mIoU for the mean, 43.5 after 5 median steps; gates from 0 to 0.2 are
-        alike within 0.1, and more costs.
+      alike within 0.1, and more costs.
     """
 
     gate: float = number(
@@ -263,8 +258,7 @@ class RefineSection(Section):
     start: Literal["auto", "trained", "lifted", "both"] = setting(
         "auto",
         "features that are refined, both: midway between their directions; auto: both where the "
-        "capture has depth, "
-        "trained where it has not, lifted where none are trained",
+        "capture has depth, trained where it has not, lifted where none are trained",
     )
     smooth: Literal["auto", "on", "off"] = setting(
         "auto",
@@ -284,8 +278,7 @@ class KnowledgeSection(Section):
     start: Text = setting(
         "rooms",
         "what a scene starts from: none; shipped, to which nothing is added; the name of a set of "
-        "lessons in the "
-        "work folder, which its own joins; or folder/ of a knowledge artifact",
+        "lessons in the work folder, which its own joins; or folder/ of a knowledge artifact",
     )
 
 

@@ -25,29 +25,27 @@ log = logging.getLogger("chebsplat")
 # the fields of `Points` but the local shape, and seen_from [N]: the view that a point is from
 Cloud = dict[str, Any]
 N_NEIGHBORS = 16  # that give a point its normal and covariance
-CANDIDATES = 16  # pixels with depth that are looked at, for each point that is wanted
-TRIED = 2000  # points that are held against depth
-EVEN = 0.55  # of the points wanted: there whatever the colours are, for shape is read off these
+CANDIDATES = 16  # pixels with depth that are drawn for each point of `sfm.max_points`
+TRIED = 2000  # points that are compared with depth
+EVEN = 0.55  # of `sfm.max_points`: spaced evenly whatever the colours, for shape
 
 
 def run(job: Job) -> None:
-    """Cameras, and points with the covariance and normal of their neighbours (docs/method.md,
-    section 1).
+    """Cameras, and points with normals and local covariances (docs/method.md, section 1).
 
-    Reads `capture`. Writes `points`. Poses, points and depth that the capture holds are taken; what
-    it lacks is computed by feature matching and triangulation, as is everything where
-    `sfm.matching` names a way to match.
+    Reads `capture`. Writes `points`. Poses, points and depth of the capture are used as they are;
+    what it lacks is computed by feature matching and triangulation, as is everything where
+    `sfm.matching` is not `auto`.
     """
     settings, capture = job.config.sfm, Capture.read(job.inputs["capture"])
     spares = capture.points is not None or capture.depth is not None
-    given = capture.cam_from_world is not None and settings.matching == "auto" and spares
-    # otherwise all matches tell
-    adjusted = wants_adjustment(job, capture, settings) if given else None
-    given = given and not adjusted
-    if given and capture.points is not None:
+    use_poses = capture.cam_from_world is not None and settings.matching == "auto" and spares
+    adjusted = wants_adjustment(job, capture, settings) if use_poses else None
+    use_poses = use_poses and not adjusted
+    if use_poses and capture.points is not None:
         job.left_out("feature matching", "poses are given, and points by the source")
         cloud = from_source(capture, settings)
-    elif given:
+    elif use_poses:
         job.left_out("feature matching", "poses and depth are given: points come from depth")
         _, cloud = reduced(
             from_depth(job, capture, settings), settings.max_points, settings.spacing
@@ -66,7 +64,7 @@ def run(job: Job) -> None:
         raise DataFailure(
             f"only {n} points were found, at least 16 are needed; add views with more overlap"
         )
-    off = {} if "reprojection_error_px" in cloud["notes"] else missed(capture, cloud)
+    off = {} if "reprojection_error_px" in cloud["notes"] else check_points(capture, cloud)
     if depths is not None:
         behind = backdrop(capture, cloud)
         cloud = joined(cloud, behind) | {
@@ -92,12 +90,12 @@ def run(job: Job) -> None:
     ).write(job.out)
 
 
-def missed(capture: Capture, cloud: Cloud) -> dict[str, float]:
-    """How far points that no matches have shown lie off the depth of training views, `depth_error`,
-    a share of it, the median; without depth, which share of the photos' cells holds a point,
-    `covered`.
+def check_points(capture: Capture, cloud: Cloud) -> dict[str, float]:
+    """Error of points that come from no matches: `depth_error`, the median of their distance from
+    the depth of training views, as a share of it; without depth `covered`, the share of the photos'
+    cells that hold a point.
 
-    Choices: TRIED points, by 8 views; what differs by more than a tenth lies behind something else.
+    Choices: TRIED points, in 8 views; more than a tenth off, a point is hidden by another surface.
     """
     if capture.depth is None:
         return {
@@ -114,23 +112,22 @@ def missed(capture: Capture, cloud: Cloud) -> dict[str, float]:
         surface = capture.depth[view][v.astype(int), u.astype(int)]
         apart = np.abs(z - surface) / np.where(surface > 0, surface, np.nan)
         errors.append(apart[apart < 0.1])
-    found = np.concatenate(errors)
-    return {"depth_error": float(np.median(found))} if len(found) else {}
+    relative = np.concatenate(errors)
+    return {"depth_error": float(np.median(relative))} if len(relative) else {}
 
 
 def filled(
     cloud: Cloud, more: Cloud, count: int, spacing: str = "even", name: str = "n_from_depth"
 ) -> Cloud:
-    """A cloud with the points of another one of the same views between its own, at most `count`,
-    one a cube.
+    """Union of two clouds of the same views, thinned to one point a cube, at most `count`.
 
-    Args:    name: of the note that counts those that were added.
-    Choices: triangulated points show where the photos have texture, those of depth what lies
-      between; a cube with both keeps the triangulated one.
+    Args:    name: of the note that counts the points of `more`.
+    Choices: triangulated points lie where the photos have texture, those of depth in between; a
+      cube with both keeps the triangulated one.
     """
-    kept, found = reduced(joined(cloud, more), count, spacing)
-    found["notes"] |= {name: int((kept >= len(cloud["means"])).sum())}
-    return found
+    rows, union = reduced(joined(cloud, more), count, spacing)
+    union["notes"] |= {name: int((rows >= len(cloud["means"])).sum())}
+    return union
 
 
 def joined(cloud: Cloud, more: Cloud) -> Cloud:
@@ -141,48 +138,43 @@ def joined(cloud: Cloud, more: Cloud) -> Cloud:
 
 
 def reduced(cloud: Cloud, count: int, spacing: str) -> tuple[np.ndarray, Cloud]:
-    """Which points of a cloud are kept, at most `count`, and the cloud of these.
+    """Rows of at most `count` points of a cloud, one a cube, and the cloud of these.
 
-    Args: spacing: even: one point a cube of one size; color: of cubes that are the smaller the more
-      their points'
-          colours differ, and the mean of these colours.
+    Args: spacing: even: cubes of one size; color: cubes that are the smaller the more the colours
+      within differ, and the mean of these colours.
     """
     colors, tracks, notes = cloud["colors"], cloud["tracks"], dict(cloud["notes"])
     if spacing == "color" and len(cloud["means"]) > count:
         edge = edge_of(cloud["means"], int(EVEN * count))
-        kept, cube = by_color(cloud["means"], colors, count, edge)
+        rows, cube = by_color(cloud["means"], colors, count, edge)
         sums = np.stack([np.bincount(cube, colors[:, k]) for k in range(3)], 1)
         colors = (sums / np.bincount(cube)[:, None]).round().astype(np.uint8)
         notes |= {"largest": edge, "from": cloud["means"].min(0).tolist()}
     else:
-        kept = thin(cloud["means"], count)
-        colors = colors[kept]
+        rows = thin(cloud["means"], count)
+        colors = colors[rows]
     row = np.full(len(cloud["means"]), -1)
-    row[kept] = np.arange(len(kept))
+    row[rows] = np.arange(len(rows))
     tracks = tracks[row[tracks[:, 0]] >= 0]
     tracks = np.stack([row[tracks[:, 0]], tracks[:, 1]], 1)
-    same = {key: cloud[key][kept] for key in ("means", "seen_from")}
-    return kept, cloud | same | {"colors": colors, "tracks": tracks, "notes": notes}
+    same = {key: cloud[key][rows] for key in ("means", "seen_from")}
+    return rows, cloud | same | {"colors": colors, "tracks": tracks, "notes": notes}
 
 
 def from_depth(
     job: Job, capture: Capture, settings: SfmSection, poses: np.ndarray | None = None
 ) -> Cloud:
-    """Points back-projected from the depth of training views, CANDIDATES times as many as are
-    wanted, in random order.
+    """Points from depth of training views, CANDIDATES times `sfm.max_points`, in random order.
 
-    Args: poses [V, 4, 4]: of the capture's views where they were adjusted; their depth goes with
-      them.
+    Args: poses [V, 4, 4]: of the capture's views where they were adjusted.
     Choices: test views give no points; pixels are drawn evenly over views.
     """
     assert capture.cam_from_world is not None and capture.depth is not None
-    rng, poses = (
-        np.random.default_rng(settings.seed),
-        capture.cam_from_world if poses is None else poses,
-    )
+    rng = np.random.default_rng(settings.seed)
+    poses = capture.cam_from_world if poses is None else poses
     used = np.flatnonzero(~capture.is_test)
     per_view = max(CANDIDATES * settings.max_points // max(len(used), 1), 16)
-    means, colors, seen = [], [], []
+    means, colors, view_of = [], [], []
     for view, status in job.progress.track(used, len(used), "depth"):
         depth, image = capture.depth[view], capture.images[view]
         valid = np.isfinite(depth) & (depth > 0)
@@ -192,7 +184,7 @@ def from_depth(
         pixels = pixels[rng.choice(len(pixels), min(per_view, len(pixels)), replace=False)]
         means.append(unproject(depth, capture.Ks[view], poses[view], pixels))
         colors.append(image[pixels[:, 0], pixels[:, 1]])
-        seen.append(np.full(len(pixels), view))
+        view_of.append(np.full(len(pixels), view))
         status["points"] = sum(map(len, means))
     points = np.concatenate(means)
     if len(points) == 0:
@@ -206,26 +198,25 @@ def from_depth(
         "cam_from_world": poses,
         "means": points[order],
         "colors": np.concatenate(colors)[order],
-        "seen_from": np.concatenate(seen)[order],
+        "seen_from": np.concatenate(view_of)[order],
         "tracks": np.zeros((0, 2), np.int32),
         "notes": {"how": "depth", "n_candidates": len(points)},
     }
 
 
 def from_source(capture: Capture, settings: SfmSection) -> Cloud:
-    """The source's own points that a training view has in its image, thinned to one a voxel.
+    """The source's own points that project into a training view, thinned to one a voxel.
 
-    Choices: a point is taken as seen from the nearest such view, which turns its normal; walls in
-      between are not
-    looked for. Points without colours, or with some that tell nothing, take the pixels there
-    (`tell_of`).
+    Choices: a point is visible from the nearest such view, which orients its normal; occlusion is
+      not tested. Points without colours, or with colours unlike the photos' (`tell_of`), take the
+      pixels there.
     """
     assert capture.cam_from_world is not None and capture.points is not None
-    kept = thin(capture.points, settings.max_points)
-    points, (width, height) = capture.points[kept].astype(np.float64), capture.size
-    distance, seen = np.full(len(points), np.inf), np.full(len(points), -1)
+    rows = thin(capture.points, settings.max_points)
+    points, (width, height) = capture.points[rows].astype(np.float64), capture.size
+    distance, view_of = np.full(len(points), np.inf), np.full(len(points), -1)
     pixels, colors = np.zeros((len(points), 3), np.uint8), capture.point_colors
-    tracks = tracks_of(capture, kept)
+    tracks = tracks_of(capture, rows)
     for view in np.flatnonzero(~capture.is_test):
         pose = capture.cam_from_world[view]
         camera = points @ pose[:3, :3].T + pose[:3, 3]
@@ -243,16 +234,16 @@ def from_source(capture: Capture, settings: SfmSection) -> Cloud:
             & (v < height)
             & (away < distance)
         )
-        distance[nearer], seen[nearer] = away[nearer], view
+        distance[nearer], view_of[nearer] = away[nearer], view
         pixels[nearer] = capture.images[view][v[nearer].astype(int), u[nearer].astype(int)]
-    inside = seen >= 0
-    if colors is not None and not tell_of(colors[kept][inside], pixels[inside]):
+    inside = view_of >= 0
+    if colors is not None and not tell_of(colors[rows][inside], pixels[inside]):
         log.warning(
             "the source's colours of points tell nothing of the photos; the photos' own are taken"
         )
         colors = None
-    colors = pixels if colors is None else colors[kept]
-    tracks = tracks_of(capture, kept[inside])
+    colors = pixels if colors is None else colors[rows]
+    tracks = tracks_of(capture, rows[inside])
     log.info(
         "%d of the source's %d points are used; nothing is matched",
         inside.sum(),
@@ -262,9 +253,9 @@ def from_source(capture: Capture, settings: SfmSection) -> Cloud:
         "names": list(capture.names),
         "Ks": capture.Ks,
         "cam_from_world": capture.cam_from_world,
-        "means": capture.points[kept][inside],
+        "means": capture.points[rows][inside],
         "colors": colors[inside],
-        "seen_from": seen[inside],
+        "seen_from": view_of[inside],
         "tracks": tracks,
         "notes": {
             "how": "source",
@@ -274,13 +265,11 @@ def from_source(capture: Capture, settings: SfmSection) -> Cloud:
     }
 
 
-def tracks_of(capture: Capture, kept: np.ndarray) -> np.ndarray:
-    """The source's tracks i32 [T, 2] (point, view) of some of its points, which are counted anew;
-    none without any.
-    """
+def tracks_of(capture: Capture, rows: np.ndarray) -> np.ndarray:
+    """The source's tracks i32 [T, 2] (point, view) of these rows of its points, renumbered."""
     if capture.points is None or capture.tracks is None:
         return np.zeros((0, 2), np.int32)
     place = np.full(len(capture.points), -1)
-    place[kept] = np.arange(len(kept))
+    place[rows] = np.arange(len(rows))
     tracks = np.stack([place[capture.tracks[:, 0]], capture.tracks[:, 1]], 1)
     return tracks[tracks[:, 0] >= 0].astype(np.int32)

@@ -1,5 +1,4 @@
-"""teach: the encoder that scenes start from, taught over generated rooms what a 2D teacher says of
-them, and what these rooms teach as lessons.
+"""teach: train the shipped encoder of shape on generated rooms, and sum these rooms' lessons.
 
 See docs/method.md, section 14.
 """
@@ -41,15 +40,15 @@ from chebsplat.shape.point_encoder import Example, PointEncoder, cloud_of
 from chebsplat.stages.runtime.command import Job, n_threads
 from chebsplat.stages.settings import TeachSection
 from chebsplat.stages.shape_models.answers import SEEN, units
-from chebsplat.stages.shape_models.teaching_rooms import Room, held, kept_as, prepare
-from chebsplat.stages.teacher_models.text_encoder import found, text_embeddings
+from chebsplat.stages.shape_models.teaching_rooms import Room, load_room, prepare, room_path
+from chebsplat.stages.teacher_models.text_encoder import match_names, text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.layout import KNOWLEDGE
 
 log = logging.getLogger("chebsplat")
 KINDS = ("held_out", "held_out_worn", "held_out_few", "held_out_swept")
 N_DRAWN = 3000  # points of a room that its lesson is of
-PARTS = 2  # that the rooms' sums are kept in
+PARTS = 2  # into which the rooms' sums are split
 
 
 def run(job: Job) -> None:
@@ -67,10 +66,10 @@ def run(job: Job) -> None:
         raise InputError(
             f"{job.inputs['channels']} is of another teacher than {teacher.path}; pass its own"
         )
-    rooms = prepared(job, settings, channels.matrix)
+    rooms = prepare_rooms(job, settings, channels.matrix)
     lessons, tested = rooms[: settings.n_rooms], rooms[settings.n_rooms :]
     words, embeddings = vocabulary(teacher, list(CLASS_NAMES), channels.matrix)
-    named = found(list(CLASS_NAMES), words)
+    named = match_names(list(CLASS_NAMES), words)
     if -1 in named:
         job.left_out(
             "figures on rooms held out",
@@ -82,7 +81,7 @@ def run(job: Job) -> None:
         raise DataFailure(
             f"{bare} rooms have no point that {LEAST_VIEWS} photos see; raise teach.n_views"
         )
-    encoder = taught(job, settings, examples)
+    encoder = train_encoder(job, settings, examples)
     weights = {
         name: value.numpy()
         for name, value in encoder.state_dict().items()
@@ -92,19 +91,21 @@ def run(job: Job) -> None:
         mean_lesson(job, encoder, lessons[part::PARTS], classes)
         for part in range(min(PARTS, len(lessons)))
     ]
-    found_map = mapped(of_rooms, [], []).astype(np.float32)
+    shape_map = mapped(of_rooms, [], []).astype(np.float32)
     whole = mean_of(of_rooms)
     scale = scale_of(whole)
-    known = basis(whole, scale)
+    shape_basis = basis(whole, scale)
     card = settings.model_dump(mode="json", exclude={"model", "seed"})
     newest: dict[str, float] = {}
     for name, of in zip(KINDS, zip(*tested, strict=True), strict=True):
         encoded = [encoder.encode(room.inputs) for room in of]
         sums = [lesson_of(z, room, classes) for z, room in zip(encoded, of, strict=True)]
-        newest[name] = max(scaled_novelty(novelty(one, scale, known), one.spread()) for one in sums)
+        newest[name] = max(
+            scaled_novelty(novelty(one, scale, shape_basis), one.spread()) for one in sums
+        )
         if -1 not in named:
-            card[name] = measured(
-                [z @ found_map[:, : len(classes[0])] for z in encoded], of, classes
+            card[name] = measure_accuracy(
+                [z @ shape_map[:, : len(classes[0])] for z in encoded], of, classes
             )
     card["novelty"] = newest
     job.facts |= card
@@ -116,17 +117,27 @@ def run(job: Job) -> None:
     write_knowledge(
         job.out,
         Knowledge(
-            teacher.name, teacher.digest(), encoder.settings, weights, channels.matrix, describe, words,
-            embeddings.astype(np.float16), found_map, known.astype(np.float32), scale.astype(np.float32), card,
+            teacher.name,
+            teacher.digest(),
+            encoder.settings,
+            weights,
+            channels.matrix,
+            describe,
+            words,
+            embeddings.astype(np.float16),
+            shape_map,
+            shape_basis.astype(np.float32),
+            scale.astype(np.float32),
+            card,
             shipped=list(of_rooms),
         ),
-    )  # fmt: skip
+    )
 
 
 def mean_lesson(
     job: Job, encoder: PointEncoder, rooms: Sequence[Sequence[Room]], embeddings: np.ndarray
 ) -> Sums:
-    """The mean lesson of rooms, each as depth has it, worn, half seen and swept."""
+    """Mean lesson of rooms, each in all its versions."""
     flat = [room for kinds in rooms for room in kinds]
     parts = (
         drawn_lesson(encoder, room, embeddings)
@@ -139,24 +150,23 @@ def mean_lesson(
 
 
 def drawn_lesson(encoder: PointEncoder, room: Room, embeddings: np.ndarray) -> Sums:
-    """What N_DRAWN points of a room teach, drawn by how much each teaches: among many rooms as good
-    as all of them.
-    """
-    meanings, chances = told(room, embeddings)
+    """Lesson of N_DRAWN points of a room, drawn by weight: over many rooms as good as all."""
+    meanings, chances = make_targets(room, embeddings)
     rows = np.random.default_rng(0).choice(len(chances), N_DRAWN, p=chances)
     return summed(encoder.encode(room.inputs, rows), meanings[rows], np.ones(N_DRAWN))
 
 
 def lesson_of(z: np.ndarray, room: Room, embeddings: np.ndarray) -> Sums:
-    """What one room teaches, by the features z [N, p] of its shape."""
-    meanings, weights = told(room, embeddings)
+    """Lesson of all points of a room, by the features z [N, p] of its shape."""
+    meanings, weights = make_targets(room, embeddings)
     return summed(z, meanings, weights)
 
 
-def told(room: Room, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What the teacher says of a room's points, [N, 2 d], and how much each teaches, [N], sum 1.
+def make_targets(room: Room, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Targets [N, 2 d] of a room's points, the teacher's features beside the unit embedding of the
+    label, and the points' weights [N], sum 1.
 
-    Args: embeddings [L, d], of the labels that it gives. The halves: its features, and unit words.
+    Args: embeddings [L, d]: of the labels.
     """
     labels = decode_labels(room.features, embeddings)
     meanings = np.concatenate([room.features, units(embeddings)[labels]], 1)
@@ -166,21 +176,17 @@ def told(room: Room, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def vocabulary(
     teacher: TeacherModel, names: list[str], matrix: np.ndarray
 ) -> tuple[list[str], np.ndarray]:
-    """Words that the teacher knows, of its table, otherwise these names; and their embeddings f32
-    [W, d].
-    """
+    """Words of the teacher's table, or else these names; their embeddings f32 [W, d]."""
     words = names if teacher.labels is None else read_label_table(teacher.labels)[0]
     return words, text_embeddings(words, teacher) @ matrix
 
 
-def prepared(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[list[Room]]:
-    """The rooms to teach on, then those held out: clean, worn, half seen, swept; a process for each
-    thread.
-    """
+def prepare_rooms(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[list[Room]]:
+    """Rooms to train on, then rooms held out: clean, worn, half seen, swept; a process a thread."""
     seeds = [*KNOWLEDGE[: settings.n_rooms], *KNOWLEDGE[-settings.n_held_out :]]
     folder = job.scratch / "rooms"
     folder.mkdir(parents=True, exist_ok=True)
-    missing = [seed for seed in seeds if not kept_as(folder, seed).is_file()]
+    missing = [seed for seed in seeds if not room_path(folder, seed).is_file()]
     if len(missing) < len(seeds):
         job.watch.go_on(job.scratch)
     if missing:
@@ -188,23 +194,22 @@ def prepared(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[list[
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(n_threads(), mp_context=context) as pool:
             jobs = [pool.submit(prepare, folder, seed, settings, matrix) for seed in missing]
-            done = as_completed(jobs)
             for finished, _ in job.progress.track(
-                done, len(seeds), "rooms", len(seeds) - len(missing)
+                as_completed(jobs), len(seeds), "rooms", len(seeds) - len(missing)
             ):
                 finished.result()
                 job.watch.keep(job.scratch)
-    return [held(folder, seed) for seed in seeds]
+    return [load_room(folder, seed) for seed in seeds]
 
 
 def example_of(room: Room, embeddings: np.ndarray) -> Example:
-    """A room as the encoder is taught it: labels are the teacher's."""
+    """Training example of a room, with the teacher's labels."""
     labels = decode_labels(room.features, embeddings)
     return Example(cloud_of(room.inputs), torch.from_numpy(room.features), room.n_views, labels)
 
 
-def taught(job: Job, settings: TeachSection, examples: list[Example]) -> PointEncoder:
-    """The encoder after the whole course."""
+def train_encoder(job: Job, settings: TeachSection, examples: list[Example]) -> PointEncoder:
+    """The encoder after all steps of training."""
     torch.set_num_threads(n_threads())
     torch.manual_seed(settings.seed)
     clouds = [example.cloud for example in examples]
@@ -214,28 +219,26 @@ def taught(job: Job, settings: TeachSection, examples: list[Example]) -> PointEn
     encoder.set_inputs(clouds)
     course = point_encoder.Course(steps=settings.steps, seed=settings.seed)
     losses: deque[float] = deque(maxlen=100)
-    steps = point_encoder.taught(encoder, examples, course)
+    steps = point_encoder.train_encoder(encoder, examples, course)
     for loss, status in job.progress.track(steps, settings.steps, "teach"):
         losses.append(loss)
         status["mean loss"] = f"{sum(losses) / len(losses):.4f}"
     return encoder.eval()
 
 
-def measured(
+def measure_accuracy(
     answers: Sequence[np.ndarray], rooms: Sequence[Room], embeddings: np.ndarray
 ) -> dict[str, float]:
-    """Of points of rooms held out, the share whose label is right: by the teacher's averages, by
-    shape, and by both.
-    """
+    """Accuracy of labels on rooms held out: by the teacher's averages, by shape, and by both."""
     right: dict[str, list[float]] = {"teacher": [], "shape": [], "both": []}
     for shape, room in zip(answers, rooms, strict=True):
-        known = (room.labels >= 0) & (room.n_views > 0)
+        has_truth = (room.labels >= 0) & (room.n_views > 0)
         for name, features in (
             ("teacher", room.features),
             ("shape", shape),
             ("both", room.features + shape),
         ):
             right[name].append(
-                float((decode_labels(features, embeddings) == room.labels)[known].mean())
+                float((decode_labels(features, embeddings) == room.labels)[has_truth].mean())
             )
     return {name: float(np.mean(values)) for name, values in right.items()}

@@ -1,6 +1,4 @@
-"""teacher: per-view semantic features, from the capture's labels through a noise model or from an
-ONNX model.
-"""
+"""teacher: per-view semantic features, of labels through a noise model or of an ONNX model."""
 
 from __future__ import annotations
 
@@ -27,12 +25,11 @@ from chebsplat.stages.teacher_models.onnx_session import CUDA, GPU_REMEDY, provi
 from chebsplat.stages.training.truth import pixels_right
 
 log = logging.getLogger("chebsplat")
-MIRRORED = 25  # views, of which one is looked at mirrored, too: 4 % of the stage's time
+MIRRORED = 25  # one of so many views is encoded mirrored, too: 4 % of the stage's time
 
 
 def run(job: Job) -> None:
-    """Features, labels and their confidence of every view, as a 2D teacher sees it (docs/method.md,
-    section 9).
+    """A 2D teacher's features, labels and confidences of all views (docs/method.md, section 9).
 
     Reads `capture` and, where an ONNX teacher's channels are reduced, `channels`. Writes
     `features`.
@@ -55,15 +52,16 @@ def run(job: Job) -> None:
 
 
 def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
-    """Features of every view by an ONNX model, the embedded one if none is given; of a killed run,
-    finished views stay.
+    """Write features of every view by an ONNX model, by default the embedded one; resumes.
 
     Choices: test views are encoded too, because evaluate reports the teacher's own figures on them.
     """
     teacher = read_teacher(Path(settings.model) if settings.model else EMBEDDED)
     network = TeacherInference(teacher, n_threads(), job.device)
     if job.device == "cuda" and CUDA not in providers(job.device):
-        job.left_out("the teacher on the GPU", f"onnxruntime here has no CUDA ({GPU_REMEDY})")
+        why = f"onnxruntime here has no CUDA ({GPU_REMEDY})"
+        job.left_out("the teacher on the GPU", why)
+        log.info("the teacher runs on the CPU: %s", why)
     if teacher.guessed:
         log.info(
             "%s has no `output`: logits, as %s holds names alone", teacher.settings, teacher.labels
@@ -72,16 +70,21 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     channels = None
     if teacher.output == "logits":
         labels = label_set(teacher, settings.labels, None) if settings.labels else None
-        space = closed_set(teacher, labels, n_channels, settings.n_channels)
         network.judge(capture.images)
+        shares = network.class_shares(capture.images, grid)
+        space = closed_set(teacher, labels, shares, settings.n_channels)
+        if space.left_out:
+            job.left_out(
+                "classes of outdoors", f"the views are of a room: {', '.join(space.left_out)}"
+            )
     else:
         if "channels" in job.inputs:
             channels = ChannelMap.read(job.inputs["channels"])
         elif n_channels > MAX_CHANNELS:
             raise ConfigError(
                 f"{teacher.path} has {n_channels} channels, at most {MAX_CHANNELS} can be "
-                "rendered; use "
-                "`chebsplat run`, or reduce them with `chebsplat channels` and pass --in-channels"
+                "rendered; use `chebsplat run`, or reduce them with `chebsplat channels` and pass "
+                "--in-channels"
             )
         labels = label_set(teacher, settings.labels, capture.class_names)
         space = open_vocabulary(teacher, labels, n_channels, channels)
@@ -102,30 +105,31 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
         "channels": read_manifest(job.inputs["channels"]).key if channels else None,
         "teacher": [sha256_file(path) for path in teacher.files()],
         "labels": labels,
+        "names": space.names,
         "convention": convention,
     }
     shape = (*grid, space.embeddings.shape[1])
     writer = FeatureWriter(job.scratch / "features", capture.names, shape, made_with)
-    waiting = [view for view in range(len(capture.names)) if view not in writer.done]
-    if writer.done:
+    waiting = [view for view in range(len(capture.names)) if view not in writer.finished]
+    if writer.finished:
         job.watch.go_on(job.scratch)
         log.info(
             "%d of %d views are there from a run that was stopped",
-            len(writer.done),
+            len(writer.finished),
             len(capture.names),
         )
-    for view, _ in job.progress.track(waiting, len(capture.names), "teacher", len(writer.done)):
+    for view, _ in job.progress.track(waiting, len(capture.names), "teacher", len(writer.finished)):
         name = capture.names[view]
         features = network.features(
             capture.images[view], grid, settings.scales, settings.flips, name
         )
         writer.add(view, *space.split(features))
         job.watch.keep(job.scratch)
-    made = writer.finish(job.out, space.names, space.embeddings, convention, channels)
-    assert made.pseudo_labels is not None  # `split` gives them
+    record = writer.finish(job.out, space.names, space.embeddings, convention, channels)
+    assert record.pseudo_labels is not None  # `split` gives them
     alike = []
     for view in range(MIRRORED // 2, len(capture.names), MIRRORED):
-        image, upright = capture.images[view], np.asarray(made.pseudo_labels[view])
+        image, upright = capture.images[view], np.asarray(record.pseudo_labels[view])
         once = (grid, settings.scales, False, capture.names[view])
         if settings.flips:
             upright = space.split(network.features(image, *once))[1]
@@ -134,7 +138,7 @@ def from_onnx(job: Job, capture: Capture, settings: TeacherSection) -> None:
     job.facts |= {"kind": "onnx", "n_labels": len(space.names), "convention": convention}
     job.facts |= {
         "mirrored_alike": float(np.mean(alike)) if alike else None,
-        "right": pixels_right(capture, made),
+        "right": pixels_right(capture, record),
     }
 
 
@@ -150,10 +154,8 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
         )
     codes = class_codes(capture.class_names, settings.n_channels)
     training = np.flatnonzero(~capture.is_test)
-    images, labels = (
-        np.asarray(capture.images[:])[training],
-        np.asarray(capture.labels[:])[training],
-    )
+    images = np.asarray(capture.images[:])[training]
+    labels = np.asarray(capture.labels[:])[training]
     probabilities = model.confusable(model.class_colors(images, labels, len(codes)))
     rows = []
     for view, _ in job.progress.track(range(len(capture.names)), len(capture.names), "teacher"):
@@ -184,9 +186,7 @@ def from_labels(job: Job, capture: Capture, settings: TeacherSection) -> Feature
 
 
 def from_pseudo_labels(job: Job, capture: Capture, settings: TeacherSection) -> Features:
-    """What a 2D network took the views for, as the source brings it; a pixel weighs as much as it
-    is sure.
-    """
+    """A 2D network's labels of the views, from the source, weighted by their confidence."""
     if capture.pseudo_labels is None or capture.confidence is None or not capture.class_names:
         raise DataFailure(
             "the capture has no pseudo labels with confidences; use teacher.kind = auto"

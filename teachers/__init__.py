@@ -1,3 +1,1 @@
-"""The embedded 2D teacher: a small dense image encoder that ships with the package, and what it was
-trained by.
-"""
+"""The embedded 2D teacher, a small dense image encoder that ships, and its training."""

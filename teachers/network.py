@@ -21,7 +21,7 @@ MULTIPLE = 16  # sides of an image must be a multiple of it
 STRIDE = 2  # of the output
 WIDTHS = (16, 48, 96, 128)  # channels at 1/2, 1/4, 1/8 and 1/16 of the resolution
 DEPTHS = (0, 1, 2, 5)  # residual blocks there
-DILATIONS = (1, 2, 4)  # in turn at 1/16: an image of 320 x 240 is met as a whole
+DILATIONS = (1, 2, 4)  # in turn at 1/16: the receptive field covers 320 x 240
 OPSET = 18
 HALVED = 512  # numbers a constant must have to be stored as float16
 TOML = """\
@@ -46,16 +46,15 @@ class Residual(nn.Module):
             nn.Conv2d(channels, channels, 1, bias=False),
             nn.BatchNorm2d(channels),
         )
-        nn.init.zeros_(self.body[-1].weight)  # type: ignore[arg-type]  # a block begins as the identity
+        # a block begins as the identity
+        nn.init.zeros_(self.body[-1].weight)  # type: ignore[arg-type]
 
     def forward(self, x: Tensor) -> Tensor:
         return F.relu(x + self.body(x), inplace=True)
 
 
 def _step(inward: int, outward: int, kernel: int, stride: int = 1) -> nn.Sequential:
-    """Convolution, normalisation, ReLU; a kernel of 4 at stride 2 keeps cells centred on the pixels
-    they cover.
-    """
+    """Convolution, normalisation, ReLU; kernel 4 at stride 2 keeps cells centred on the pixels."""
     conv = nn.Conv2d(inward, outward, kernel, stride, padding=1 if kernel > 1 else 0, bias=False)
     return nn.Sequential(conv, nn.BatchNorm2d(outward), nn.ReLU(inplace=True))
 
@@ -144,9 +143,7 @@ def export(encoder: Encoder, out: Path, mean: tuple[float, ...], std: tuple[floa
 
 
 def _halve(path: Path) -> None:
-    """Store the large constants as float16, each behind a cast that onnxruntime folds when it loads
-    the model.
-    """
+    """Store large constants as float16, each behind a cast that onnxruntime folds on loading."""
     model: Any = onnx.load(str(path))
     casts = []
     for constant in model.graph.initializer:
@@ -167,9 +164,7 @@ def _halve(path: Path) -> None:
 
 
 def forget_origin(model: Any) -> None:
-    """Take out what the exporter notes of the code that made a model: paths of this machine, no two
-    alike.
-    """
+    """Delete the exporter's notes of the code that made a model: paths of one machine."""
     for entry in (
         model.graph,
         *model.graph.node,

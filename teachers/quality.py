@@ -1,8 +1,7 @@
-"""`make teacher-quality`: what the shipped model is worth, measured on rooms and a house it never
-met.
+"""`make teacher-quality`: figures of the shipped model on rooms and houses that it has never seen.
 
-Choices: the model is run as the teacher stage runs it, one pass a view, no flips; each class is
-  asked for by one word, and a pixel goes to the word of the greatest cosine after bilinear
+Choices: the model is run as the teacher stage runs it, one pass a view, no flips; each class has
+  one word as its query, and a pixel goes to the word of the greatest cosine after bilinear
   upsampling; one confusion matrix over all views.
 """
 
@@ -78,16 +77,16 @@ def house(folder: Path, names: list[str]) -> Iterator[View]:
 
 def figures(matrix: np.ndarray, names: list[str]) -> dict[str, Any]:
     """mIoU, mAcc, OA and IoU by class of a confusion matrix [L, L], to four digits."""
-    found = segmentation(matrix)
+    scores = segmentation(matrix)
     iou = {
         name: round(float(v), 4)
-        for name, v in zip(names, found.iou, strict=True)
+        for name, v in zip(names, scores.iou, strict=True)
         if not np.isnan(v)
     }
     return {
-        "miou": round(found.miou, 4),
-        "macc": round(found.macc, 4),
-        "oa": round(found.oa, 4),
+        "miou": round(scores.miou, 4),
+        "macc": round(scores.macc, 4),
+        "oa": round(scores.oa, 4),
         "iou": iou,
     }
 
@@ -115,18 +114,27 @@ def measured(model: Path, data: Path, threads: int) -> dict[str, Any]:
             for k, rows in enumerate(others):
                 strange[k] += confusion(labelled(vectors, rows, *truth.shape), truth, n)
     result: dict[str, Any] = {
-        "held_out": {"rooms": len(HELD_OUT), "views": len(HELD_OUT) * VIEWS, **figures(matrix, names)},
+        "held_out": {
+            "rooms": len(HELD_OUT),
+            "views": len(HELD_OUT) * VIEWS,
+            **figures(matrix, names),
+        },
         "unseen_words": [
-            {"words": [unseen[name][k] for name in names], **figures(strange[k], names)} for k in range(draws)
+            {"words": [unseen[name][k] for name in names], **figures(strange[k], names)}
+            for k in range(draws)
         ],
-        "encode": {"seconds": round(float(np.median(seconds)), 4), "size": [WIDTH, HEIGHT], "threads": threads,
-                   "load": round(os.getloadavg()[0], 1)},
-    }  # fmt: skip
-    asked = [name for name in names if name in set(tomllib.loads(MAPPING.read_text()).values())]
+        "encode": {
+            "seconds": round(float(np.median(seconds)), 4),
+            "size": [WIDTH, HEIGHT],
+            "threads": threads,
+            "load": round(os.getloadavg()[0], 1),
+        },
+    }
+    classes = [name for name in names if name in set(tomllib.loads(MAPPING.read_text()).values())]
     for name in HOUSES:
         if (data / name).is_dir():
             result[name] = house_figures(
-                encode, data / name, asked, text_embeddings(asked, teacher)
+                encode, data / name, classes, text_embeddings(classes, teacher)
             )
         else:
             click.echo(f"{data / name} is not there: not measured (CHEBSPLAT_TEST_DATA)", err=True)
@@ -134,20 +142,18 @@ def measured(model: Path, data: Path, threads: int) -> dict[str, Any]:
 
 
 def house_figures(
-    encode: Callable, folder: Path, asked: list[str], texts: np.ndarray
+    encode: Callable, folder: Path, classes: list[str], texts: np.ndarray
 ) -> dict[str, Any]:
-    """Figures of an encoder over the views of a modelled house, and the share of pixels that
-    count.
-    """
-    matrix, counted, total, views = np.zeros((len(asked),) * 2, np.int64), 0, 0, 0
-    for image, truth in house(folder, asked):
-        matrix += confusion(labelled(encode(image), texts, *truth.shape), truth, len(asked))
+    """Figures of an encoder over views of a modelled house, and the share of counted pixels."""
+    matrix, counted, total, views = np.zeros((len(classes),) * 2, np.int64), 0, 0, 0
+    for image, truth in house(folder, classes):
+        matrix += confusion(labelled(encode(image), texts, *truth.shape), truth, len(classes))
         counted, total, views = (
             counted + int((truth != IGNORE).sum()),
             total + truth.size,
             views + 1,
         )
-    return {"views": views, "counted": round(counted / total, 4), **figures(matrix, asked)}
+    return {"views": views, "counted": round(counted / total, 4), **figures(matrix, classes)}
 
 
 def table(result: dict[str, Any]) -> str:
@@ -177,16 +183,15 @@ def table(result: dict[str, Any]) -> str:
             f"{part['iou'][name]:.3f}" if name in part["iou"] else "" for part in columns.values()
         ]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    drawn = [", ".join(part["words"]) for part in result["unseen_words"]]
     lines += [
         "",
         "Counted: share of pixels whose label has a counterpart (houses.toml). Unseen words, in "
-        "the order of classes: "
-        + "; ".join(f"{k + 1}: " + ", ".join(part["words"]) for k, part in enumerate(result["unseen_words"])) + ".",
+        f"the order of classes: {'; '.join(f'{k}: {row}' for k, row in enumerate(drawn, 1))}.",
         "",
         f"One view of {encode['size'][0]} x {encode['size'][1]}: {encode['seconds']} s (median), "
-        f"{encode['threads']} "
-        f"threads of onnxruntime, load average {encode['load']}.",
-    ]  # fmt: skip
+        f"{encode['threads']} threads of onnxruntime, load average {encode['load']}.",
+    ]
     return "\n".join(lines) + "\n"
 
 

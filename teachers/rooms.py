@@ -63,9 +63,7 @@ def generator_digest() -> str:
 
 
 def viewpoint(size: tuple[float, float, float], rng: Generator) -> np.ndarray:
-    """A pose [4, 4] of somebody standing a metre or more from the walls, who looks more often
-    across the room.
-    """
+    """A pose [4, 4] of a person a metre or more from the walls, mostly looking across the room."""
     w, d, _ = size
     eye = np.array([rng.uniform(1.0, w - 1.0), rng.uniform(1.0, d - 1.0), rng.uniform(1.25, 1.85)])
     across = np.arctan2(d / 2 - eye[1], w / 2 - eye[0])
@@ -139,12 +137,10 @@ def crops(
 
 
 def recolored(images: Tensor, generator: torch.Generator) -> Tensor:
-    """Images [B, 3, H, W] in [0, 1] under other light and by another camera; four in ten are left
-    as they are.
-    """
+    """Images [B, 3, H, W] in [0, 1] in other light and by another camera; four in ten unchanged."""
     n, untouched = len(images), images
 
-    def chosen(share: float) -> Tensor:
+    def draw_mask(share: float) -> Tensor:
         return (_uniform(n, generator) < share)[:, None, None, None]
 
     def number(low: float, high: float) -> Tensor:
@@ -152,19 +148,19 @@ def recolored(images: Tensor, generator: torch.Generator) -> Tensor:
 
     mix = torch.eye(3) + 0.1 * torch.randn(n, 3, 3, generator=generator)
     order = torch.stack([torch.randperm(3, generator=generator) for _ in range(n)])
-    mix = torch.where(chosen(0.08)[:, 0], torch.eye(3)[order], mix)
-    mix = torch.where(chosen(0.05)[:, 0], torch.full((3, 3), 1 / 3), mix)
-    images = torch.where(chosen(0.8), torch.einsum("bij,bjhw->bihw", mix, images), images)
+    mix = torch.where(draw_mask(0.08)[:, 0], torch.eye(3)[order], mix)
+    mix = torch.where(draw_mask(0.05)[:, 0], torch.full((3, 3), 1 / 3), mix)
+    images = torch.where(draw_mask(0.8), torch.einsum("bij,bjhw->bihw", mix, images), images)
     images = images * torch.exp(0.25 * torch.randn(n, 1, 1, 1, generator=generator))
     images = images * torch.exp(0.1 * torch.randn(n, 3, 1, 1, generator=generator)) + number(
         -0.08, 0.08
     )
     images = images.clip(1e-4, 1) ** torch.exp(0.3 * torch.randn(n, 1, 1, 1, generator=generator))
     smooth = F.avg_pool2d(F.pad(images, (1, 1, 1, 1), mode="replicate"), 3, 1)
-    images = torch.where(chosen(0.5), images + number(-0.6, 1) * (smooth - images), images)
-    sigma = torch.where(chosen(0.5), number(0, 0.05), torch.zeros(()))
+    images = torch.where(draw_mask(0.5), images + number(-0.6, 1) * (smooth - images), images)
+    sigma = torch.where(draw_mask(0.5), number(0, 0.05), torch.zeros(()))
     noisy = (images + sigma * torch.randn(images.shape, generator=generator)).clip(0, 1)
-    return torch.where(chosen(0.4), untouched, noisy)
+    return torch.where(draw_mask(0.4), untouched, noisy)
 
 
 def _uniform(n: int, generator: torch.Generator, low: float = 0.0, high: float = 1.0) -> Tensor:

@@ -2,7 +2,7 @@
 
 Choices: cross entropy over the cosines of a pixel's vector with one word of each class, drawn anew
   for every step, so that the vectors suit all words for a class; and a pull towards the embedding
-  of the class's words themselves, without which vectors need only be told apart, and mean nothing
+  of the class's words themselves, without which vectors need only differ by class, and mean nothing
   to words that were not in training. Rare classes weigh more. Weights are averaged over the last
   steps. bfloat16 in the convolutions: twice the speed, no measurable loss.
 """
@@ -74,8 +74,8 @@ def validated(trunk: Trunk, images: np.ndarray, labels: np.ndarray, texts: Tenso
 
 @dataclass
 class Target:
-    """What vectors are drawn to: basis [384, RANK]; in its coordinates the words [W, RANK] of
-    classes owner [W], the classes' mean words [22, RANK], unit, and their names [22, RANK].
+    """Target of the vectors: basis [384, RANK]; in its coordinates the words [W, RANK] of classes
+    owner [W], the classes' mean words [22, RANK], unit, and their names [22, RANK].
     """
 
     basis: Tensor
@@ -108,14 +108,14 @@ def target() -> Target:
 def train(
     rooms: tuple[np.ndarray, np.ndarray],
     share: np.ndarray,
-    held: tuple[np.ndarray, np.ndarray],
+    validation: tuple[np.ndarray, np.ndarray],
     steps: int,
     out: Path,
 ) -> Encoder:
     """Trains on views, each drawn with its share; the log goes to out/training.csv, the network to
     out/teacher.pt.
 
-    Args: rooms, held: images u8 [N, H, W, 3] and labels i8 [N, H, W]; share [N], its sum 1.
+    Args: rooms, validation: images u8 [N, H, W, 3] and labels i8 [N, H, W]; share [N], its sum 1.
     """
     torch.manual_seed(0)
     rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
@@ -136,10 +136,10 @@ def train(
             image, texts = normalized(recolored(image, generator)), aim.drawn(rng)
             trunk.train()
             with torch.autocast("cpu", torch.bfloat16):
-                found = trunk(image)
-            found, truth = found.permute(0, 2, 3, 1)[label >= 0], label[label >= 0]
-            cosines = found.float() @ texts.T
-            pull = (1 - (found * aim.means[truth]).sum(1)).mean()
+                vectors = trunk(image)
+            vectors, truth = vectors.permute(0, 2, 3, 1)[label >= 0], label[label >= 0]
+            cosines = vectors.float() @ texts.T
+            pull = (1 - (vectors * aim.means[truth]).sum(1)).mean()
             loss = F.cross_entropy(cosines / TEMPERATURE, truth, weights) + PULL * pull
             optimizer.zero_grad()
             loss.backward()
@@ -151,7 +151,7 @@ def train(
                 status["loss"] = f"{sums[1] / sums[0]:.3f}"
                 miou = ""
                 if (step + 1) % 500 == 0 or step == last:
-                    miou = status["mIoU"] = f"{validated(average, *held, aim.names):.4f}"
+                    miou = status["mIoU"] = f"{validated(average, *validation, aim.names):.4f}"
                     torch.save(
                         {"trunk": average.state_dict(), "basis": aim.basis}, out / "teacher.pt"
                     )
@@ -164,10 +164,10 @@ def train(
 
 
 @torch.no_grad()
-def average_in(average: Trunk, trunk: Trunk, kept: float) -> None:
+def average_in(average: Trunk, trunk: Trunk, decay: float) -> None:
     """Moves the averaged weights towards the trunk's."""
     for a, b in zip(average.state_dict().values(), trunk.state_dict().values(), strict=True):
-        a.lerp_(b, 1 - kept) if a.is_floating_point() else a.copy_(b)
+        a.lerp_(b, 1 - decay) if a.is_floating_point() else a.copy_(b)
 
 
 @click.command()
@@ -185,11 +185,11 @@ def main(steps: int, threads: int, cache: Path, out: Path) -> None:
     torch.set_num_threads(threads)
     out.mkdir(parents=True, exist_ok=True)
     rooms = rendered(cache / "rooms", ROOMS, VIEWS, threads)
-    held = rendered(cache / "rooms", VALIDATION, VIEWS, threads)
+    validation = rendered(cache / "rooms", VALIDATION, VIEWS, threads)
     often = np.repeat(
         [2.0 if KINDS[seed % len(KINDS)] in PRESETS else 1.0 for seed in ROOMS], VIEWS
     )
-    encoder = train(rooms, often / often.sum(), held, steps, cache)
+    encoder = train(rooms, often / often.sum(), validation, steps, cache)
     (out / "training.csv").write_bytes((cache / "training.csv").read_bytes())
     export(encoder, out, MEAN, STD)
 

@@ -1,6 +1,4 @@
-"""What the classes are called, and the frozen text embeddings of those words. `python -m` writes
-the table of words.
-"""
+"""Words for the classes and their frozen text embeddings. `python -m` writes the table of words."""
 
 from __future__ import annotations
 
@@ -27,9 +25,7 @@ def words(which: str) -> dict[str, list[str]]:
 
 
 def embedded(texts: list[str]) -> np.ndarray:
-    """Unit rows f32 [L, 384] of the sentence model. Raises ConfigError where the extra `text` is
-    missing.
-    """
+    """Unit rows f32 [L, 384] of the sentence model. ConfigError without the extra `text`."""
     try:
         return sentence_embeddings(texts)
     except ModuleNotFoundError as error:

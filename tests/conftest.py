@@ -2,7 +2,8 @@
 worker.
 """
 
-import chebsplat  # noqa: F401  # isort: skip  # before torch: OpenMP threads that spin slow parallel tests down
+# before torch: OpenMP threads that spin slow parallel tests down
+import chebsplat  # noqa: F401  # isort: skip
 import json
 
 import pytest

@@ -1,1 +1,1 @@
-"""What a finished scene costs to use."""
+"""Costs of using a finished scene."""

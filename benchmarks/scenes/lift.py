@@ -48,10 +48,10 @@ def main(arguments: Sequence[str]) -> int:
                 pose,
                 K,
                 capture.size,
-                *to_cells(said, np.ones(said.shape[:2]), capture.size),
+                *to_cells(grid, np.ones(grid.shape[:2]), capture.size),
                 gate,
             )
-            for said, pose, K in zip(maps, cameras.cam_from_world, cameras.Ks, strict=True)
+            for grid, pose, K in zip(maps, cameras.cam_from_world, cameras.Ks, strict=True)
         )
         return gathered(len(gaussians[0]), maps[0].shape[-1], views)
 
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str]) -> int:
     rows = []
     for name, seconds in best.items():
         print(
-            f"{name:<16} {seconds:6.2f} s (bar {BAR:.0f} s), {spent[name]:.2f} of processors; "
+            f"{name:<16} {seconds:6.2f} s, {spent[name]:.2f} of processors; "
             f"{sizes[name]:,} observed"
         )
         rows.append(
@@ -87,4 +87,5 @@ def main(arguments: Sequence[str]) -> int:
             }
         )
     shared.write_csv(options.out / "lift.csv", rows)
-    return int(max(best.values()) > BAR)
+    bars = [(f"{name}, s", seconds, "<=", BAR) for name, seconds in best.items()]
+    return int(not all(shared.judged(bars)))

@@ -1,5 +1,4 @@
-"""Asking, at the suggested cut: precision and recall of every class of unseen rooms, and absent
-words refused.
+"""Queries at the suggested cut: precision and recall by class in unseen rooms, absent words.
 
 Rooms are trained as they come (--settings), none of which a calibration has seen. A Gaussian is of
 the class of the nearest point of the true surface, within 10 cm; the few beyond do not count.
@@ -36,11 +35,11 @@ LEAST = 20  # Gaussians of a class, of which a room has it
 
 def classes_of(scene: Scene, capture: Path) -> np.ndarray:
     """True class of each Gaussian, i64 [N], -1 where no surface is near."""
-    held = Capture.read(capture)
-    assert held.depth is not None and held.labels is not None and held.cam_from_world is not None
+    views = Capture.read(capture)
+    assert views.depth is not None and views.labels is not None and views.cam_from_world is not None
     points, classes = [], []
     for depth, labels, K, pose in zip(
-        held.depth, held.labels, held.Ks, held.cam_from_world, strict=True
+        views.depth, views.labels, views.Ks, views.cam_from_world, strict=True
     ):
         pixels = np.argwhere(np.isfinite(depth) & (depth > 0))[::7]
         points.append(unproject(depth, K, pose, pixels))
@@ -49,19 +48,25 @@ def classes_of(scene: Scene, capture: Path) -> np.ndarray:
     return np.where(distance <= NEAR, np.concatenate(classes)[nearest], -1).astype(np.int64)
 
 
-def counts(selected: np.ndarray, truth: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
-    """How many are selected rightly, selected, and wanted."""
-    selected = selected & known
+def counts(selected: np.ndarray, truth: np.ndarray, has_truth: np.ndarray) -> tuple[int, int, int]:
+    """Numbers of Gaussians selected rightly, selected, and truly of the class."""
+    selected = selected & has_truth
     return int((selected & truth).sum()), int(selected.sum()), int(truth.sum())
 
 
 def row(room: str, name: str, rows: list[tuple[int, int, int]]) -> dict[str, Any]:
     """Precision and recall, pooled and as means of queries."""
-    right, chosen, wanted = np.array(rows).sum(0)
+    right, selected, positives = np.array(rows).sum(0)
     each = [(r / c if c else np.nan, r / w) for r, c, w in rows]
-    return {"room": room, "scores": name, "queries": len(rows), "precision": right / max(chosen, 1),
-            "recall": right / wanted, "mean_precision": float(np.nanmean([p for p, _ in each])),
-            "mean_recall": float(np.mean([r for _, r in each]))}  # fmt: skip
+    return {
+        "room": room,
+        "scores": name,
+        "queries": len(rows),
+        "precision": right / max(selected, 1),
+        "recall": right / positives,
+        "mean_precision": float(np.nanmean([p for p, _ in each])),
+        "mean_recall": float(np.mean([r for _, r in each])),
+    }
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -76,12 +81,12 @@ def main(arguments: Sequence[str]) -> int:
     options = parser.parse_args(arguments)
     folders = options.folders
     if not folders:
-        wanted = [(scene, options.settings) for scene in options.scenes.split(",")]
-        folders = [store.work() / plan.title for plan in shared.finished(wanted, "export")]
+        runs = [(scene, options.settings) for scene in options.scenes.split(",")]
+        folders = [store.work() / plan.title for plan in shared.finished(runs, "export")]
     absent = tomllib.loads(EMBEDDED.with_name("words.toml").read_text())["absent"]["measured"]
     table: list[dict[str, Any]] = []
     pooled: dict[str, list[tuple[int, int, int]]] = {"calibrated": [], "relevancy above 0.5": []}
-    refused, found = [], []
+    refused, detected = [], []
     for folder in folders:
         scene = Scene.read(folder / "export")
         features, classes = scene.parameters["features"], classes_of(scene, folder / "ingest")
@@ -92,11 +97,13 @@ def main(arguments: Sequence[str]) -> int:
                 continue
             answer = understood(folder / "teacher", word, []).answer(features)
             plain = understood(folder / "teacher", word, list(CANONICAL))
-            scores = {"calibrated": answer.selected,
-                      "relevancy above 0.5": relevancy(features, plain.embedding, plain.against) > 0.5}  # fmt: skip
+            scores = {
+                "calibrated": answer.selected,
+                "relevancy above 0.5": relevancy(features, plain.embedding, plain.against) > 0.5,
+            }
             for name, selected in scores.items():
                 here[name].append(counts(selected, truth, classes >= 0))
-            found.append(bool(answer.present))
+            detected.append(bool(answer.present))
         lacking = [
             bool(understood(folder / "teacher", word, []).answer(features).present)
             for word in absent
@@ -106,7 +113,7 @@ def main(arguments: Sequence[str]) -> int:
         for name, rows in here.items():
             pooled[name] += rows
     total = [row("all", name, rows) for name, rows in pooled.items()]
-    total[0] |= {"present_found": float(np.mean(found)), "refused": float(np.mean(refused))}
+    total[0] |= {"present_found": float(np.mean(detected)), "refused": float(np.mean(refused))}
     table += total
     shared.write_csv(options.out / "query.csv", table)
     for line in table:
@@ -115,5 +122,6 @@ def main(arguments: Sequence[str]) -> int:
             for key, value in line.items()
         )
         print("  ".join(cells))
-    print(f"{len(folders)} rooms, {len(absent)} absent words, {shared.processor()}; bars: {BARS}")
-    return int(any(total[0][name] < bar for name, bar in BARS.items()))
+    print(f"{len(folders)} rooms, {len(absent)} absent words, {shared.processor()}")
+    bars: list[shared.Bar] = [(name, total[0][name], ">=", bar) for name, bar in BARS.items()]
+    return int(not all(shared.judged(bars)))

@@ -1,9 +1,8 @@
 """Error against run time of what follows a training: the lift, smoothing, and knowledge of shape.
 
 mIoU is of rendered test views, beside the processor seconds that each form takes once kernels are
-compiled, all that it
-needs included: knowledge needs the lift, for its evidence, and smoothing. Figures and picture go to
-  `--out`.
+compiled, all that it needs included: knowledge needs the lift, for its evidence, and smoothing.
+Figures and picture go to `--out`.
 """
 
 from __future__ import annotations
@@ -68,14 +67,14 @@ class Scene:
             if capture.is_test[row[name]]:
                 _, rendered = renderer.render(camera(self.gaussians, k), with_features=True)
                 assert rendered is not None and capture.labels is not None
-                said = as_class[decode_labels(rendered, self.taught.label_embeddings)]
-                counts += confusion(said, capture.labels[row[name]], len(names) + 1)
+                prediction = as_class[decode_labels(rendered, self.taught.label_embeddings)]
+                counts += confusion(prediction, capture.labels[row[name]], len(names) + 1)
         figures = segmentation(counts)
         return 100 * float(np.nanmean(figures.iou[: len(names)])), 100 * figures.oa
 
 
 def timed(make: Callable[[], Result]) -> tuple[Result, float]:
-    """What the second call gives, and its processor seconds, of all threads; the first compiles."""
+    """Value of the second call and its processor seconds, of all threads; the first compiles."""
     make()
     began = time.process_time()
     return make(), time.process_time() - began
@@ -85,8 +84,15 @@ def main(arguments: Sequence[str]) -> None:
     parser = shared.parser("refine", __doc__, work=True)
     options = parser.parse_args(arguments)
     scene, shipped = Scene(options.work), read_knowledge(SHIPPED)
-    told = scene.capture, scene.gaussians.cameras, scene.gaussians.parameters, scene.taught
-    lifted, to_lift = timed(lambda: lifted_from(*told, LiftSection().gate, Progress(False)))
+    inputs_of_lift = (
+        scene.capture,
+        scene.gaussians.cameras,
+        scene.gaussians.parameters,
+        scene.taught,
+    )
+    lifted, to_lift = timed(
+        lambda: lifted_from(*inputs_of_lift, LiftSection().gate, Progress(False))
+    )
     near, to_compare = timed(lambda: affinities(scene.means, *scene.surface))
     smoothed, to_smooth = timed(lambda: smooth(scene.features, lifted.n_views, near))
     rows: list[dict[str, Any]] = []
@@ -112,21 +118,21 @@ def main(arguments: Sequence[str]) -> None:
     )
     inputs, (means, normals) = inputs_of(SHIPPED, described, shipped), in_scene(described)
 
-    def known() -> np.ndarray:
+    def carry_knowledge() -> np.ndarray:
         return carry(
             translated(answered(shipped, inputs)), means, normals, scene.means, scene.surface[0]
         )[0]
 
-    knowledge, to_know = timed(known)
+    knowledge, to_know = timed(carry_knowledge)
 
     def blended() -> np.ndarray:
-        chosen = calibrate(lifted.halves, lifted.half_views, near, knowledge)
+        choice = calibrate(lifted.halves, lifted.half_views, near, knowledge)
         evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views)
         evidence = evidence * familiar(lifted.features, knowledge, scene.taught.label_embeddings)
-        start = smoothed if chosen.smooth else scene.features
-        result = blend(start, evidence, knowledge, chosen.strength)
-        votes = evidence + trusted(knowledge, chosen.strength)
-        return smooth(result, votes, near) if chosen.smooth else result
+        start = smoothed if choice.smooth else scene.features
+        result = blend(start, evidence, knowledge, choice.strength)
+        votes = evidence + trusted(knowledge, choice.strength)
+        return smooth(result, votes, near) if choice.smooth else result
 
     result, to_blend = timed(blended)
     add("and knowledge", to_lift + to_compare + to_smooth + to_know + to_blend, result)

@@ -1,10 +1,8 @@
-"""Photos that come alone: what the stage `pose` makes of them, beside pycolmap's defaults on the
-same files.
+"""Photos that come alone: the stage `pose` beside pycolmap's defaults on the same files.
 
 Errors are in units of the photo's longer side. A folder with a `truth.json`, which maps a photo's
-stem to its
-camera-to-world matrix in metres, is held against it, too: medians of the angle and of the distance
-  after a similarity.
+stem to its camera-to-world matrix in metres, is held against it, too: medians of the angle and of
+the distance after a similarity.
 """
 
 from __future__ import annotations
@@ -59,22 +57,21 @@ def main(arguments: Sequence[str]) -> int:
                     f"| {folder.name} | {len(os.listdir(photos))} | {error} |{' |' * 8}", flush=True
                 )
                 continue
-            seconds, held = time.perf_counter() - began, model.judged
-            print(f"| {folder.name} | {held['n_given']} | {held['n_registered']} | "
-                  f"{theirs.get('n')} | "
-                  f"{held['n_points']} | {theirs.get('points')} | "
-                  f"{held['reprojection_error']:.2e} | "
-                  f"{theirs.get('error', np.nan):.2e} | {seconds:.0f} | {their_seconds:.0f} | "
-                  f"{against(model, folder / 'truth.json')} |", flush=True)  # fmt: skip
-            for doubt in held["doubts"]:
+            seconds, facts = time.perf_counter() - began, model.judged
+            print(
+                f"| {folder.name} | {facts['n_given']} | {facts['n_registered']} | "
+                f"{theirs.get('n')} | {facts['n_points']} | {theirs.get('points')} | "
+                f"{facts['reprojection_error']:.2e} | {theirs.get('error', np.nan):.2e} | "
+                f"{seconds:.0f} | {their_seconds:.0f} | {against(model, folder / 'truth.json')} |",
+                flush=True,
+            )
+            for doubt in facts["doubts"]:
                 print(f"  {doubt}", flush=True)
     return 0
 
 
 def defaults(photos: Path, place: Path, threads: int) -> tuple[dict[str, Any], float]:
-    """Photos, points and error of the largest model that pycolmap's defaults find with one
-    SIMPLE_RADIAL camera.
-    """
+    """Photos, points, error of the largest model by pycolmap's defaults, one SIMPLE_RADIAL."""
     pycolmap.logging.minloglevel = 2
     began, database = time.perf_counter(), place / "theirs.db"
     extraction, matching = pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions()
@@ -100,7 +97,7 @@ def defaults(photos: Path, place: Path, threads: int) -> tuple[dict[str, Any], f
 
 
 def against(model: PhotoModel, path: Path) -> str:
-    """Medians of what a model's poses miss the true ones by, and how many do by more than FAR.
+    """Medians of the errors of a model's poses, and the number of errors beyond FAR.
 
     Choices: after the similarity that fits the half that it fits best, so that misplaced photos
       move no other.
@@ -108,15 +105,15 @@ def against(model: PhotoModel, path: Path) -> str:
     if not path.exists():
         return "-"
     truth = {name: np.linalg.inv(pose) for name, pose in json.loads(path.read_text()).items()}
-    given, found = np.stack([truth[name] for name in model.names]), model.cam_from_world
-    near = np.ones(len(given), bool)
+    exact, poses = np.stack([truth[name] for name in model.names]), model.cam_from_world
+    near = np.ones(len(exact), bool)
     for _ in range(ROUNDS):
-        scale, rotation, shift = alignment(found[near], given[near])
-        aligned = found.copy()
-        aligned[:, :3, :3] = found[:, :3, :3] @ rotation.T
-        places = scale * centers(found) @ rotation.T + shift
+        scale, rotation, shift = alignment(poses[near], exact[near])
+        aligned = poses.copy()
+        aligned[:, :3, :3] = poses[:, :3, :3] @ rotation.T
+        places = scale * centers(poses) @ rotation.T + shift
         aligned[:, :3, 3] = -np.einsum("vij,vj->vi", aligned[:, :3, :3], places)
-        moved, turned = differences(aligned, given)
+        moved, turned = differences(aligned, exact)
         near = moved <= np.median(moved)
     return (
         f"{np.degrees(np.median(turned)):.2f}°, {100 * np.median(moved):.1f} cm, "

@@ -1,6 +1,4 @@
-"""What breaks a plain blend of views with knowledge of shape, and its way from points
-(docs/method.md, section 13).
-"""
+"""Blends of views with knowledge of shape that break the plain way (docs/method.md, section 13)."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ TOLERANCE = 1e-5  # float32 results
 
 
 class Parts(NamedTuple):
-    """What is blended: features and knowledge [N, C], evidence [N], and the strength."""
+    """Parts of a blend: features and knowledge [N, C], evidence [N], and the strength."""
 
     features: np.ndarray
     evidence: np.ndarray
@@ -37,12 +35,12 @@ class Parts(NamedTuple):
 
 
 def parts(
-    feature: Any = 1.0, evidence: Any = 1.0, known: Any = 1.0, strength: float = 2.0
+    feature: Any = 1.0, evidence: Any = 1.0, length: Any = 1.0, strength: float = 2.0
 ) -> Parts:
-    """Noise; known: lengths of what is known."""
+    """Noise; length: of the knowledge."""
     rng = np.random.default_rng(0)
     knowledge = rng.normal(size=(N, C))
-    knowledge *= (np.broadcast_to(known, N) / np.linalg.norm(knowledge, axis=1))[:, None]
+    knowledge *= (np.broadcast_to(length, N) / np.linalg.norm(knowledge, axis=1))[:, None]
     return Parts(
         (feature * rng.normal(size=(N, C))).astype(np.float32),
         (evidence * rng.uniform(1, 5, N)).astype(np.float32),
@@ -54,16 +52,16 @@ def parts(
 WIDE, SOME = np.geomspace(1e-15, 1e15, N), np.arange(N) % 2
 BLENDS: dict[str, Callable[[], Parts]] = {
     "no evidence": lambda: parts(evidence=0.0),
-    "no evidence and nothing known": lambda: parts(evidence=0.0, known=0.0),
-    "no evidence of half, half known": lambda: parts(evidence=SOME, known=SOME),
+    "no evidence and nothing known": lambda: parts(evidence=0.0, length=0.0),
+    "no evidence of half, half known": lambda: parts(evidence=SOME, length=SOME),
     "strength 0": lambda: parts(strength=0.0),
     "strength 1e-30": lambda: parts(strength=1e-30),
     "strength 1e+30": lambda: parts(strength=1e30),
     "evidence of 1e-30": lambda: parts(evidence=1e-30),
     "evidence of 1e+30": lambda: parts(evidence=1e30),
     "evidence of 1e-15 to 1e+15": lambda: parts(evidence=WIDE),
-    "knowledge of length 1e-12": lambda: parts(known=1e-12),
-    "knowledge of length 1e+15": lambda: parts(known=1e15),
+    "knowledge of length 1e-12": lambda: parts(length=1e-12),
+    "knowledge of length 1e+15": lambda: parts(length=1e15),
     "features of 1e-30": lambda: parts(feature=1e-30),
     "features of 1e+30": lambda: parts(feature=1e30),
 }
@@ -72,8 +70,8 @@ BLENDS: dict[str, Callable[[], Parts]] = {
 def blended(of: Parts, dtype: type) -> np.ndarray:
     f, e, g = (part.astype(dtype) for part in of[:3])
     k = dtype(of.strength) * np.sqrt((g * g).sum(1)).clip(0, 1) ** SURE
-    found = (e[:, None] * f + k[:, None] * g) / (e + k)[:, None]
-    return np.where(k[:, None] > 0, found, f) if dtype is np.longdouble else found
+    mean = (e[:, None] * f + k[:, None] * g) / (e + k)[:, None]
+    return np.where(k[:, None] > 0, mean, f) if dtype is np.longdouble else mean
 
 
 @case("a blend, {name}", name=BLENDS)
@@ -99,15 +97,15 @@ def sure(size: float, views: float) -> Outcome:
         e = n.astype(dtype) / (1 + dtype(ALIKE) * np.maximum(n - 1, 0))
         k = dtype(of.strength) * np.ones(N, dtype)
         lengths = np.sqrt((f * f).sum(1))
-        known = g / np.sqrt((g * g).sum(1))[:, None]
+        direction_of_shape = g / np.sqrt((g * g).sum(1))[:, None]
         direction = (
             f / (np.where(lengths > 0, lengths, 1) if dtype is np.longdouble else lengths)[:, None]
         )
-        summed = e[:, None] * direction + k[:, None] * known
+        summed = e[:, None] * direction + k[:, None] * direction_of_shape
         return np.asarray(np.sqrt((summed * summed).sum(1)) / (e + 1 + k))
 
-    found = confidence(of.features, n, np.ones(N), of.knowledge, of.strength)
-    return beside(found, lambda: surely(np.float32), surely(np.longdouble), TOLERANCE)
+    ours = confidence(of.features, n, np.ones(N), of.knowledge, of.strength)
+    return beside(ours, lambda: surely(np.float32), surely(np.longdouble), TOLERANCE)
 
 
 @case("what views count for, halves of {size:.0e}", size=[0.0, 1e-30, 1e-10, 1e10, 1e30])
@@ -124,12 +122,12 @@ def halves(size: float) -> Outcome:
         )
         return np.asarray(cosines.clip(0, 1) ** AGREED * n / (1 + dtype(ALIKE) * (n - 1)))
 
-    found = reliable(both, np.ones((2, N))) * effective(n)
-    return beside(found, lambda: counted(np.float32), counted(np.longdouble), TOLERANCE)
+    ours = reliable(both, np.ones((2, N))) * effective(n)
+    return beside(ours, lambda: counted(np.float32), counted(np.longdouble), TOLERANCE)
 
 
 @case("a strength is chosen alike for features of {size:.0e}", size=[1e-30, 1e-10, 1e10, 1e30])
-def chosen(size: float) -> Outcome:
+def choose_strength(size: float) -> Outcome:
     """Agreement of the halves as for features of 1, which only directions tell."""
     rng, near = (
         np.random.default_rng(0),
@@ -147,10 +145,8 @@ def chosen(size: float) -> Outcome:
     return beside(agreement(np.float32, size), plainly, agreement(np.float64, 1.0), TOLERANCE)
 
 
-class Known(NamedTuple):
-    """values at points with normals, carried to means with normals; unit: scene units of a
-    metre.
-    """
+class PointValues(NamedTuple):
+    """values at points with normals, for means with normals; unit: scene units of a metre."""
 
     values: np.ndarray
     points: np.ndarray
@@ -160,7 +156,9 @@ class Known(NamedTuple):
     unit: float = 1.0
 
 
-def known(n_points: int = 40, units: float = 1.0, shift: float = 0.0, far: float = 0.0) -> Known:
+def point_values(
+    n_points: int = 40, units: float = 1.0, shift: float = 0.0, far: float = 0.0
+) -> PointValues:
     rng = np.random.default_rng(2)
     normals = rng.normal(size=(n_points + N, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -173,28 +171,28 @@ def known(n_points: int = 40, units: float = 1.0, shift: float = 0.0, far: float
         places[n_points:],
         normals[n_points:],
     )
-    return Known(*of, units)
+    return PointValues(*of, units)
 
 
-CARRIED: dict[str, Callable[[], Known]] = {
-    "1 point": lambda: known(1),
-    "2 points": lambda: known(2),
-    "units of 1e-06": lambda: known(units=1e-6),
-    "units of 1e+06": lambda: known(units=1e6),
-    "1e+04 from the origin": lambda: known(shift=1e4),
-    "1e+08 from the origin": lambda: known(shift=1e8),
-    "Gaussians 1e+08 away": lambda: known(far=1e8),
-    "Gaussians at the points": lambda: known()._replace(means=known().points[:N]),
-    "points in one place": lambda: known(3)._replace(points=np.full((3, 3), 0.5)),
-    "normals at right angles": lambda: known()._replace(
+CARRIED: dict[str, Callable[[], PointValues]] = {
+    "1 point": lambda: point_values(1),
+    "2 points": lambda: point_values(2),
+    "units of 1e-06": lambda: point_values(units=1e-6),
+    "units of 1e+06": lambda: point_values(units=1e6),
+    "1e+04 from the origin": lambda: point_values(shift=1e4),
+    "1e+08 from the origin": lambda: point_values(shift=1e8),
+    "Gaussians 1e+08 away": lambda: point_values(far=1e8),
+    "Gaussians at the points": lambda: point_values()._replace(means=point_values().points[:N]),
+    "points in one place": lambda: point_values(3)._replace(points=np.full((3, 3), 0.5)),
+    "normals at right angles": lambda: point_values()._replace(
         point_normals=np.eye(3)[[0] * 40], normals=np.eye(3)[[1] * N]
     ),
-    "values of 1e-30": lambda: known()._replace(values=1e-30 * known().values),
-    "values of 1e+30": lambda: known()._replace(values=1e30 * known().values),
+    "values of 1e-30": lambda: point_values()._replace(values=1e-30 * point_values().values),
+    "values of 1e+30": lambda: point_values()._replace(values=1e30 * point_values().values),
 }
 
 
-def carried(of: Known, dtype: type) -> np.ndarray:
+def carried(of: PointValues, dtype: type) -> np.ndarray:
     values, points, theirs, means, normals = (part.astype(dtype) for part in of[:5])
     square = (((means[:, None] - points[None]) / dtype(of.unit)) ** 2).sum(-1)
     near = np.argsort(square, 1, kind="stable")[:, :N_POINTS]
@@ -207,5 +205,5 @@ def carried(of: Known, dtype: type) -> np.ndarray:
 def carries(name: str) -> Outcome:
     """Against 80 bits over all points."""
     of = CARRIED[name]()
-    found, _ = carry(*of)
-    return beside(found, lambda: carried(of, np.float32), carried(of, np.longdouble), TOLERANCE)
+    ours, _ = carry(*of)
+    return beside(ours, lambda: carried(of, np.float32), carried(of, np.longdouble), TOLERANCE)

@@ -1,4 +1,4 @@
-"""What a case is, and how one is run."""
+"""Cases of the stability benchmark, and the way to run one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 
 class Outcome(NamedTuple):
-    """What a case returns; it passes if error <= tolerance, so NaN fails."""
+    """Outcome of a case; it passes if error <= tolerance, so NaN fails."""
 
     # of our float32 result, relative to the oracle's largest value unless the module says otherwise
     error: float
@@ -39,8 +39,7 @@ CASES: dict[tuple[str, str], Callable[[], Outcome]] = {}
 def case(
     name: str, /, **values: Iterable[Any]
 ) -> Callable[[Callable[..., Outcome]], Callable[..., Outcome]]:
-    """Register a function as a case of its module, or as one for each combination of keyword
-    values.
+    """Register a function as a case of its module, or one for each combination of keyword values.
 
     Args: name: unique in its module; keyword values are filled in by `str.format`.
     """
@@ -71,28 +70,24 @@ def run(key: tuple[str, str]) -> Row:
     return Row(*key, *outcome, passed, note, time.perf_counter() - began)
 
 
-def relative(found: Any, exact: Any) -> float:
-    """Largest absolute difference over the largest absolute value (over 1 where that is 0); inf
-    where not finite.
-    """
-    found, exact = np.asarray(found, np.float64), np.asarray(exact, np.float64)
-    if found.shape != exact.shape or not (np.isfinite(found).all() and np.isfinite(exact).all()):
+def relative(ours: Any, exact: Any) -> float:
+    """Largest absolute difference over the largest absolute value (or 1); inf if not finite."""
+    ours, exact = np.asarray(ours, np.float64), np.asarray(exact, np.float64)
+    if ours.shape != exact.shape or not (np.isfinite(ours).all() and np.isfinite(exact).all()):
         return float("inf")
-    if not found.size:
+    if not ours.size:
         return 0.0
-    return float(np.abs(found - exact).max() / (np.abs(exact).max() or 1.0))
+    return float(np.abs(ours - exact).max() / (np.abs(exact).max() or 1.0))
 
 
 def beside(
-    found: Any,
+    ours: Any,
     naive: Callable[[], Any],
     exact: Any,
     tolerance: float,
     measure: Callable[[Any, Any], float] = relative,
 ) -> Outcome:
-    """What was found, and what the plain way finds, against what is exact; a plain way that raises
-    is off by inf.
-    """
+    """Our value and the plain one against the exact one; a plain way that raises is inf off."""
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         try:
@@ -100,4 +95,4 @@ def beside(
         # LinAlgError is a ValueError
         except (ArithmeticError, IndexError, RuntimeError, ValueError):
             plain = float("inf")
-    return Outcome(measure(found, exact), tolerance, plain)
+    return Outcome(measure(ours, exact), tolerance, plain)

@@ -1,6 +1,4 @@
-"""What breaks depth: planes of Gaussians, rendered and measured surfaces, and plain walls
-(docs/method.md, section 5).
-"""
+"""Planes, surfaces and walls that break the plain way to depth (docs/method.md, section 5)."""
 
 from __future__ import annotations
 
@@ -27,10 +25,10 @@ def noise(*shape: int, seed: int = 0) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed)) + 0.5
 
 
-Seen = tuple[Tensor, Tensor, Tensor, Tensor | None]  # inverse depth, coverage, truth, mask
+Surface = tuple[Tensor, Tensor, Tensor, Tensor | None]  # inverse depth, coverage, truth, mask
 
 
-def surface(unit: float = 1.0, alpha: float = 0.9) -> Seen:
+def surface(unit: float = 1.0, alpha: float = 0.9) -> Surface:
     """A surface at 0.5 to 1.5 units, measured, and rendered 10 % off."""
     truth, covered = unit * noise(HEIGHT, WIDTH), alpha * torch.ones(HEIGHT, WIDTH, 1)
     return (
@@ -41,13 +39,13 @@ def surface(unit: float = 1.0, alpha: float = 0.9) -> Seen:
     )
 
 
-def measured(change: Callable[[Tensor], object], mask: Tensor | None = None) -> Seen:
+def measured(change: Callable[[Tensor], object], mask: Tensor | None = None) -> Surface:
     rendered, covered, truth, _ = surface()
     change(truth)
     return rendered, covered, truth, mask
 
 
-LOSSES: dict[str, Callable[[], Seen]] = {
+LOSSES: dict[str, Callable[[], Surface]] = {
     "units of 1e-20": lambda: surface(1e-20),
     "units of 1e-03": lambda: surface(1e-3),
     "units of 1e+20": lambda: surface(1e20),
@@ -65,18 +63,16 @@ LOSSES: dict[str, Callable[[], Seen]] = {
 
 @case("loss, {name}", name=LOSSES)
 def loss(name: str) -> Outcome:
-    """The loss and its gradient against float64 over known pixels; the plain way masks by
-    multiplication.
-    """
+    """The loss and its gradient against float64; the plain way masks by multiplication."""
     rendered, covered, truth, mask = LOSSES[name]()
-    known = (
+    has_depth = (
         np.isfinite(truth.numpy()) & (truth.numpy() > 0) & (True if mask is None else mask.numpy())
     )
     d, a = (part.double().numpy() for part in (truth, covered[..., 0]))
-    missed = rendered.double().numpy()[known] * d[known] - a[known]
+    missed = rendered.double().numpy()[has_depth] * d[has_depth] - a[has_depth]
     exact = np.zeros(truth.shape)
-    exact[known] = np.sign(missed) * d[known] / max(known.sum(), 1)
-    wanted = np.abs(missed).sum() / max(known.sum(), 1)
+    exact[has_depth] = np.sign(missed) * d[has_depth] / max(has_depth.sum(), 1)
+    exact_loss = np.abs(missed).sum() / max(has_depth.sum(), 1)
 
     def by(function: Callable[[Tensor], Tensor]) -> tuple[np.ndarray, np.ndarray]:
         leaf = rendered.clone().requires_grad_(True)
@@ -87,11 +83,11 @@ def loss(name: str) -> Outcome:
         counts = (truth > 0) * torch.ones_like(truth) * (1 if mask is None else mask)
         return (counts * (leaf * truth - covered[..., 0]).abs()).sum() / counts.sum()
 
-    def apart(found: tuple[np.ndarray, ...], exact: tuple[np.ndarray, ...]) -> float:
-        return max(relative(*pair) for pair in zip(found, exact, strict=True))
+    def apart(ours: tuple[np.ndarray, ...], exact: tuple[np.ndarray, ...]) -> float:
+        return max(relative(*pair) for pair in zip(ours, exact, strict=True))
 
-    found = by(lambda leaf: depth_distance(leaf, covered, truth, mask))
-    return beside(found, lambda: by(plainly), (wanted, exact), LOSS, apart)
+    ours = by(lambda leaf: depth_distance(leaf, covered, truth, mask))
+    return beside(ours, lambda: by(plainly), (exact_loss, exact), LOSS, apart)
 
 
 def planes_of(cosines: np.ndarray, unit: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -108,15 +104,13 @@ def corner(
     means: np.ndarray, normals: np.ndarray, nearest: float = 0.01, dtype: type = np.float64
 ) -> np.ndarray:
     """1 / z [N] of planes at a corner of the image."""
-    given = (torch.from_numpy(part.astype(dtype)) for part in (means, normals, K))
-    return np.asarray(inverse_depths(*given, nearest).numpy() @ np.array([WIDTH, HEIGHT, 1.0]))
+    tensors = (torch.from_numpy(part.astype(dtype)) for part in (means, normals, K))
+    return np.asarray(inverse_depths(*tensors, nearest).numpy() @ np.array([WIDTH, HEIGHT, 1.0]))
 
 
 @case("planes about a cosine of {cosine:g}", cosine=[GRAZING, -GRAZING, 0.0, 1e-3, 1.0 - 1e-6])
 def jumps(cosine: float) -> Outcome:
-    """How far 1 / z at a corner moves for a turn of 1e-6; the plain way exchanges grazed planes for
-    facing ones.
-    """
+    """Change of 1 / z at a corner by a turn of 1e-6; plainly, grazed planes turn facing ones."""
     means, normals = planes_of(np.array([cosine - 1e-6, cosine + 1e-6]))
 
     def plainly() -> np.ndarray:
@@ -133,19 +127,15 @@ def jumps(cosine: float) -> Outcome:
 
 @case("planes in units of {unit:.0e}", unit=[1e-6, 1e-3, 1e3, 1e6, 1e15])
 def units(unit: float) -> Outcome:
-    """1 / z in float32, times the unit, against float64 with a unit of 1, of all angles and both
-    sides.
-    """
+    """1 / z in float32, times the unit, against float64 with a unit of 1, at all angles."""
     cosines = np.linspace(-1, 1, 41)
     exact = corner(*planes_of(cosines))
-    found = unit * corner(*planes_of(cosines, unit), 0.01 * unit, np.float32).astype(np.float64)
-    return Outcome(relative(found, exact), PLANES)
+    ours = unit * corner(*planes_of(cosines, unit), 0.01 * unit, np.float32).astype(np.float64)
+    return Outcome(relative(ours, exact), PLANES)
 
 
 def wall(tilt: float, unit: float) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
-    """Gaussians that tile a wall through (0, 0, 2), their planes, and the depth [H, W] of the
-    wall.
-    """
+    """Gaussians that tile a wall through (0, 0, 2), their planes, and the wall's depth [H, W]."""
     normal = np.array([np.sin(tilt), 0, -np.cos(tilt)])
     right, down = np.array([np.cos(tilt), 0, np.sin(tilt)]), np.array([0, 1.0, 0])
     steps = np.stack(
@@ -173,9 +163,7 @@ def wall(tilt: float, unit: float) -> tuple[tuple[np.ndarray, ...], np.ndarray, 
     unit=[0.1, 1e3],
 )
 def walls(degrees: float, unit: float) -> Outcome:
-    """Relative, against the wall's own; the plain way takes the depth of the nearest Gaussian's
-    centre.
-    """
+    """Relative to the wall's depth; the plain way takes that of the nearest Gaussian's centre."""
     gaussians, planes, exact = wall(np.radians(degrees), unit)
     depth, _ = depths(gaussians, np.eye(4), K, (WIDTH, HEIGHT), planes)
 
@@ -188,20 +176,16 @@ def walls(degrees: float, unit: float) -> Outcome:
 
 
 def patch(unit: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth of a slanted wall of one colour of which a fifth is known, 0 elsewhere; the colours;
-    all of its depth.
-    """
+    """Depth of a slanted wall of one colour, a fifth of it measured, else 0; colours; all depth."""
     row, column = np.mgrid[:HEIGHT, :WIDTH]
     exact = unit / (0.3 + 0.004 * row + 0.006 * column)
-    known = np.random.default_rng(0).random(exact.shape) < 0.2
-    return np.where(known, exact, 0), np.full((*exact.shape, 3), 0.4), exact
+    has_depth = np.random.default_rng(0).random(exact.shape) < 0.2
+    return np.where(has_depth, exact, 0), np.full((*exact.shape, 3), 0.4), exact
 
 
 @case("a plain wall in units of {unit:.0e}", unit=[1e-6, 1e-3, 1e3, 1e6])
 def plain_walls(unit: float) -> Outcome:
-    """What planes add, in units of the wall's depth; the plain way takes the mean of what is
-    known.
-    """
+    """Completed depth over the wall's; the plain way takes the mean of the measured depth."""
     depth, colors, exact = patch(unit)
     ones = np.ones_like(exact)
     return beside(
@@ -222,7 +206,7 @@ UNKNOWN: dict[str, Callable[[np.ndarray], object]] = {
 
 @case("a plain wall, {name}", name=UNKNOWN)
 def unknown(name: str) -> Outcome:
-    """What cannot tell a plane adds nothing."""
+    """Depth that defines no plane adds nothing."""
     depth, colors, _ = patch()
     UNKNOWN[name](depth)
     return Outcome(relative(completed(depth, colors), depth), 1e-6)

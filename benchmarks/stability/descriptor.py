@@ -52,31 +52,27 @@ def upright(means: np.ndarray, scale: float = 0.3) -> Region:
 def ours(
     region: Region, dtype: torch.dtype = torch.float32, pad: int = 0, **options: Any
 ) -> np.ndarray:
-    """Our descriptor [n, J, D - 1]. Raises ValueError if a second run gives other bits, or padding
-    is not zero.
-    """
+    """Our descriptor [n, J, D - 1]. ValueError if a second run differs, or padding is not zero."""
     n = len(region.means)
     padded = [
         torch.from_numpy(np.concatenate([v, np.full((pad, *v.shape[1:]), 7.0)]))[None]
         for v in region
     ]
     mask = torch.arange(n + pad)[None] < n
-    found, again = (
+    values, again = (
         describe(*padded, mask, Descriptor(**options), dtype=dtype).values[0] for _ in range(2)
     )
-    if not torch.equal(found, again):
+    if not torch.equal(values, again):
         raise ValueError("a second run gives other bits, or NaN")
-    if not (found[n:] == 0).all():
+    if not (values[n:] == 0).all():
         raise ValueError("padding is not zero")
-    return found[:n].detach().double().numpy()
+    return values[:n].detach().double().numpy()
 
 
 def compare(
     region: Region, pad: int = 0, tolerance_64: float = TOLERANCE_64, **options: Any
 ) -> Outcome:
-    """Ours, in two orders of the Gaussians, against 60 digits. Raises ValueError if float64 misses
-    its tolerance.
-    """
+    """Ours, in two orders of Gaussians, against 60 digits. ValueError if float64 is too far off."""
     exact = oracle.describe(*region, **options)
     order = np.random.default_rng(2).permutation(len(region.means))
     shuffled = Region(*(v[order] for v in region))
@@ -112,7 +108,7 @@ def outlier(distance: float) -> Region:
     return region
 
 
-def placed(units: float = 1.0, offset: float = 0.0) -> Region:
+def place(units: float = 1.0, offset: float = 0.0) -> Region:
     means, scales, rotmats = cloud()
     return Region(means * units + offset, scales * units, rotmats)
 
@@ -151,8 +147,8 @@ REGIONS: dict[str, Callable[[], Region]] = {
     "far pairs": far_pairs,
     "two far clusters": far_clusters,
     **{f"one outlier at {distance:.0e}": partial(outlier, distance) for distance in (1e4, 1e8)},
-    **{f"units {units:.0e}": partial(placed, units) for units in (1e-150, 1e-30, 1e30, 1e150)},
-    **{f"offset {offset:.0e}": partial(placed, 1.0, offset) for offset in (1e6, 1e9)},
+    **{f"units {units:.0e}": partial(place, units) for units in (1e-150, 1e-30, 1e30, 1e150)},
+    **{f"offset {offset:.0e}": partial(place, 1.0, offset) for offset in (1e6, 1e9)},
 }
 
 
@@ -210,25 +206,23 @@ def padded(n: int) -> Outcome:
 
 @case("one {bad} in the {field}", bad=[np.nan, np.inf], field=Region._fields)
 def one_broken(bad: float, field: str) -> Outcome:
-    """The row is zero, its neighbours are as if it were not there, and the region beside it keeps
-    every bit.
-    """
+    """The row is zero, its neighbours are as without it, the region beside it keeps every bit."""
     clean, other, rest = cloud(), cloud(seed=1), np.delete(np.arange(16), 5)
     broken = Region(*(v.copy() for v in clean))
     getattr(broken, field)[5].flat[1] = bad
     both = [torch.from_numpy(np.stack(v)) for v in zip(broken, other, strict=True)]
-    found = describe(*both, torch.ones(2, 16, dtype=torch.bool)).values.double().numpy()
-    if (found[0, 5] != 0).any() or not np.array_equal(found[1], ours(other)):
+    values = describe(*both, torch.ones(2, 16, dtype=torch.bool)).values.double().numpy()
+    if (values[0, 5] != 0).any() or not np.array_equal(values[1], ours(other)):
         raise ValueError("the broken row is not zero, or the region beside it has changed")
-    error = relative(found[0, rest], oracle.describe(*(v[rest] for v in clean)))
+    error = relative(values[0, rest], oracle.describe(*(v[rest] for v in clean)))
     return Outcome(error, TOLERANCE)
 
 
 @case("every Gaussian NaN")
 def all_broken() -> Outcome:
     region = cloud()
-    found = ours(region._replace(means=region.means * np.nan))
-    return Outcome(relative(found, np.zeros_like(found)), 0.0)
+    values = ours(region._replace(means=region.means * np.nan))
+    return Outcome(relative(values, np.zeros_like(values)), 0.0)
 
 
 # gradients
@@ -242,6 +236,6 @@ def gradient(name: str) -> Outcome:
     """Share of gradient entries that are not finite."""
     means, *rest = (torch.from_numpy(v)[None] for v in REGIONS[name]())
     means.requires_grad_(True)
-    found = describe(means, *rest, torch.ones(means.shape[:2], dtype=torch.bool)).values
-    (slope,) = torch.autograd.grad(found.square().sum(), means)
+    values = describe(means, *rest, torch.ones(means.shape[:2], dtype=torch.bool)).values
+    (slope,) = torch.autograd.grad(values.square().sum(), means)
     return Outcome(float(1 - torch.isfinite(slope).double().mean()), 0.0)

@@ -1,6 +1,4 @@
-"""Photos that break plain averages of how photos were exposed (docs/method.md, section 5). Errors
-are in stops.
-"""
+"""Photos that break plain means of exposures (docs/method.md, section 5). Errors are in stops."""
 
 from __future__ import annotations
 
@@ -19,9 +17,7 @@ ALIKE = 1e-6
 
 
 class Photos(NamedTuple):
-    """images u8 [V, H, W, 3], poses [V, 4, 4], points [N, 3], and the exposures that are to be
-    found, [V, 3].
-    """
+    """images u8 [V, H, W, 3], poses [V, 4, 4], points [N, 3], and the exact exposures [V, 3]."""
 
     images: np.ndarray
     poses: np.ndarray
@@ -64,7 +60,7 @@ def spoiled(change: Callable[[np.ndarray], object]) -> Photos:
 
 
 def lost(of: Photos, views: slice) -> Photos:
-    """The exposures to be found where these views tell none."""
+    """The exact exposures where these views show none."""
     exact = of.exact.copy()
     exact[views] = np.nan
     return of._replace(exact=exact - np.nanmean(exact, 0) if np.isfinite(exact).any() else exact)
@@ -89,24 +85,24 @@ TAKEN: dict[str, Callable[[], Photos]] = {
 }
 
 
-def in_stops(found: np.ndarray, exact: np.ndarray) -> float:
+def in_stops(ours: np.ndarray, exact: np.ndarray) -> float:
     """The largest difference; inf where one tells and the other does not."""
-    if not np.array_equal(np.isnan(found), np.isnan(exact)):
+    if not np.array_equal(np.isnan(ours), np.isnan(exact)):
         return float("inf")
-    return float(np.nanmax(np.abs(found - exact), initial=0.0))
+    return float(np.nanmax(np.abs(ours - exact), initial=0.0))
 
 
 @case("photos, {name}", name=TAKEN)
-def taken(name: str) -> Outcome:
+def exposures(name: str) -> Outcome:
     """The plain way takes the logarithm of each photo's mean light."""
     images, poses, points, exact = TAKEN[name]()
-    found = measured_exposures(images, np.tile(K, (len(images), 1, 1)), poses, points)
+    ours = measured_exposures(images, np.tile(K, (len(images), 1, 1)), poses, points)
 
     def plainly() -> np.ndarray:
         light = np.log2(light_of(images / 255).mean((1, 2)))
         return np.asarray(light - light.mean(0))
 
-    return beside(found, plainly, exact, STOPS, in_stops)
+    return beside(ours, plainly, exact, STOPS, in_stops)
 
 
 def path(n: int = 24, unit: float = 1.0) -> np.ndarray:
@@ -139,11 +135,11 @@ def own(name: str) -> Outcome:
     """Nothing of what changes along a path; the plain way takes what differs from the mean."""
     exposures, poses, exact = OWN[name]()
 
-    def differs(found: np.ndarray, exact: np.ndarray) -> float:
-        worst = float(np.abs(found - exact).max()) / (
+    def differs(ours: np.ndarray, exact: np.ndarray) -> float:
+        worst = float(np.abs(ours - exact).max()) / (
             float(np.nanmax(np.abs(exposures), initial=0)) or 1
         )
-        return worst if np.isfinite(found).all() else float("inf")
+        return worst if np.isfinite(ours).all() else float("inf")
 
     return beside(
         own_part(exposures, poses), lambda: exposures - exposures.mean(0), exact, 0.02, differs
@@ -152,12 +148,10 @@ def own(name: str) -> Outcome:
 
 @case("what is a photo's own, views at one place, {size:.0e} stops", size=[1e-6, 1.0, 1e6])
 def one_place(size: float) -> Outcome:
-    """All that differs from their mean, relative to the largest: nothing is between views at one
-    place.
-    """
+    """All that differs from their mean, relative to the largest: no view lies between others."""
     exposures = size * np.random.default_rng(0).normal(size=(24, 3))
-    found, exact = own_part(exposures, path(unit=0.0)), exposures - exposures.mean(0)
-    return Outcome(float(np.abs(found - exact).max() / np.abs(exact).max()), 0.02)
+    ours, exact = own_part(exposures, path(unit=0.0)), exposures - exposures.mean(0)
+    return Outcome(float(np.abs(ours - exact).max() / np.abs(exact).max()), 0.02)
 
 
 @case("a photo relit by {stops:g} stops", stops=[0.0, 60.0, -60.0, 1000.0, -1000.0])

@@ -18,9 +18,7 @@ N, MOST = 120, 32
 
 
 class Growing(NamedTuple):
-    """A region of the first half of the Gaussians, in a box of `unit`, of a gradient `gradient`
-    times the threshold.
-    """
+    """A region of half the Gaussians, in a box of `unit`; gradient: times the threshold."""
 
     unit: float
     gradient: float = 2.5
@@ -44,7 +42,7 @@ REGIONS: dict[str, Growing] = {
 
 @case("Eq 12, {name}", name=REGIONS)
 def count(name: str) -> Outcome:
-    """Raises ValueError where none came and some should, or the reverse."""
+    """Raises ValueError where no Gaussian came and some should, or the reverse."""
     region = REGIONS[name]
     g = torch.Generator().manual_seed(0)
     raw = {

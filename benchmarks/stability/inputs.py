@@ -1,5 +1,4 @@
-"""Clouds that break what the encoder of shape sees, and what it makes of that (docs/method.md,
-sections 2 and 14).
+"""Clouds that break inputs and features of the encoder of shape (docs/method.md, 2 and 14).
 
 A cloud that was scaled with its unit, moved, turned with `up` or put into another order is the same
 room: the truth is what is seen of it as it was, in double precision throughout but for the
@@ -49,7 +48,7 @@ def cloud(n: int = N) -> Cloud:
     )
 
 
-def placed(unit: float = 1.0, shift: Any = 0.0) -> Cloud:
+def place(unit: float = 1.0, shift: Any = 0.0) -> Cloud:
     of = cloud()
     return Cloud(unit * of.means + shift, of.normals, unit**2 * of.covariances, of.up, unit)
 
@@ -60,28 +59,26 @@ def turned(of: Cloud, up: float = 1.0) -> Cloud:
     return Cloud(of.means @ turn.T, of.normals @ turn.T, covariances, up * turn @ of.up)
 
 
-def seen(of: Cloud) -> PointInputs:
+def inputs_of(of: Cloud) -> PointInputs:
     return point_inputs(*of[:3], up=of.up, unit=of.unit, n_neighbors=NEIGHBORS)
 
 
 SAME: dict[str, Callable[[], Cloud]] = {
-    "in units of 1e-03": lambda: placed(1e-3),
-    "in units of 1e+03": lambda: placed(1e3),
-    "in units of 1e+06": lambda: placed(1e6),
-    "1e+04 from the origin": lambda: placed(shift=1e4),
-    "1e+06 from the origin": lambda: placed(shift=1e6),
+    "in units of 1e-03": lambda: place(1e-3),
+    "in units of 1e+03": lambda: place(1e3),
+    "in units of 1e+06": lambda: place(1e6),
+    "1e+04 from the origin": lambda: place(shift=1e4),
+    "1e+06 from the origin": lambda: place(shift=1e6),
     "up of length 1e-30": lambda: cloud()._replace(up=1e-30 * cloud().up),
     "up of length 1e+30": lambda: cloud()._replace(up=1e30 * cloud().up),
 }
 
 
-def apart(found: PointInputs, exact: PointInputs) -> float:
-    """The largest error of own inputs, places, normals and descriptors; inf where a neighbour is
-    another.
-    """
-    if not np.array_equal(found.neighbors, exact.neighbors):
+def apart(ours: PointInputs, exact: PointInputs) -> float:
+    """Largest error of own inputs, places, normals, descriptors; inf if a neighbour is another."""
+    if not np.array_equal(ours.neighbors, exact.neighbors):
         return float("inf")
-    return max(relative(a, b) for a, b in zip(found[:4], exact[:4], strict=True))
+    return max(relative(a, b) for a, b in zip(ours[:4], exact[:4], strict=True))
 
 
 @case("a room {name}", name=SAME)
@@ -90,17 +87,17 @@ def same(name: str) -> Outcome:
     of = SAME[name]()
 
     def plainly() -> PointInputs:
-        return seen(Cloud(*(np.asarray(part, np.float32) for part in of[:4]), of.unit))
+        return inputs_of(Cloud(*(np.asarray(part, np.float32) for part in of[:4]), of.unit))
 
-    return beside(seen(of), plainly, seen(cloud()), SEEN, apart)
+    return beside(inputs_of(of), plainly, inputs_of(cloud()), SEEN, apart)
 
 
 @case("a room turned with up of length {length:.0e}", length=[1e-30, 1.0, 1e30])
 def turning(length: float) -> Outcome:
-    """What does not depend on where north is: own inputs, distances, neighbours, descriptors."""
-    found, exact = seen(turned(cloud(), length)), seen(cloud())
-    lengths = [np.linalg.norm(of.means[:, None] - of.means, axis=-1) for of in (found, exact)]
-    return Outcome(max(relative(found.own, exact.own), relative(*lengths)), SEEN)
+    """Inputs that do not depend on where north is: own ones, distances, neighbours, descriptors."""
+    ours, exact = inputs_of(turned(cloud(), length)), inputs_of(cloud())
+    lengths = [np.linalg.norm(of.means[:, None] - of.means, axis=-1) for of in (ours, exact)]
+    return Outcome(max(relative(ours.own, exact.own), relative(*lengths)), SEEN)
 
 
 FEW: dict[str, Callable[[], Cloud]] = {
@@ -129,8 +126,8 @@ def own(name: str) -> Outcome:
     The plain way takes the roots of eigenvalues in float32, which rounding has below 0.
     """
     of = FEW[name]()
-    found = seen(of)
-    if not all(np.isfinite(part).all() for part in found):
+    inputs = inputs_of(of)
+    if not all(np.isfinite(part).all() for part in inputs):
         raise ValueError("an input is not finite")
     heights = of.means[:, 2] - (np.quantile(of.means[:, 2], 0.005) if len(of.means) else 0)
     values = np.linalg.eigvalsh(of.covariances.astype(np.longdouble).astype(np.float64)).clip(1e-14)
@@ -144,52 +141,50 @@ def own(name: str) -> Outcome:
     def plainly() -> np.ndarray:
         return columns(np.linalg.eigvalsh(of.covariances.astype(np.float32)))
 
-    return beside(found.own, plainly, columns(values), SEEN)
+    return beside(inputs.own, plainly, columns(values), SEEN)
 
 
 def encoder(attends: bool = True) -> PointEncoder:
     """With weights as they begin, inputs standardised as in a room."""
     torch.manual_seed(0)
-    made = PointEncoder(
+    network = PointEncoder(
         4,
-        seen(cloud(1)).descriptors.shape[1],
+        inputs_of(cloud(1)).descriptors.shape[1],
         n_components=16,
         width=16,
         hidden=16,
         attends=attends,
     )
-    made.norm_own.deviation[:] = 0.5
-    made.components.normal_(0, 0.1)
-    return made.eval()
+    network.norm_own.deviation[:] = 0.5
+    network.components.normal_(0, 0.1)
+    return network.eval()
 
 
 def encoded(of: PointInputs, dtype: torch.dtype, attends: bool = True) -> np.ndarray:
     """Features of points in this precision."""
     from chebsplat.shape.point_encoder import cloud_of
 
-    made, given = encoder(attends).to(dtype), cloud_of(of)
-    given = type(given)(*(part.to(dtype) for part in given[:4]), given.neighbors)
+    network, tensors = encoder(attends).to(dtype), cloud_of(of)
+    tensors = type(tensors)(*(part.to(dtype) for part in tensors[:4]), tensors.neighbors)
     with torch.no_grad():
-        found = made(
-            given,
-            made.embedded(given.own, given.descriptors),
-            torch.arange(len(given.own)),
-            given.neighbors,
+        features = network(
+            tensors,
+            network.embedded(tensors.own, tensors.descriptors),
+            torch.arange(len(tensors.own)),
+            tensors.neighbors,
         )
-    return found.numpy()
+    return features.numpy()
 
 
 def spoiled(change: Callable[[PointInputs], dict[str, np.ndarray]]) -> PointInputs:
-    of = seen(cloud(60))
+    of = inputs_of(cloud(60))
     return of._replace(
         **{name: values.astype(getattr(of, name).dtype) for name, values in change(of).items()}
     )
 
 
 def filled(of: PointInputs) -> PointInputs:
-    """Inputs in which nobody is missing: the first point takes everybody's place who is not
-    there.
-    """
+    """Inputs without a missing neighbour: the first point takes the place of each."""
     return of._replace(neighbors=np.maximum(of.neighbors, 0))
 
 
@@ -210,9 +205,7 @@ ENCODE: dict[str, Callable[[], PointInputs]] = {
 
 @case("encoded, {name}", name=ENCODE)
 def encodes(name: str) -> Outcome:
-    """float32 beside float64, with attention and without; the plain way takes the first point where
-    nobody is.
-    """
+    """float32 beside float64, with attention and without; plainly, the first point fills gaps."""
     of = ENCODE[name]()
 
     def both(of: PointInputs, dtype: torch.dtype) -> np.ndarray:
@@ -232,7 +225,7 @@ def encodes(name: str) -> Outcome:
 )
 def reordered(name: str) -> Outcome:
     """As before, point by point."""
-    of = seen(cloud(60))
+    of = inputs_of(cloud(60))
     exact, rows = encoded(of, torch.float64), np.arange(60)
     if "points" in name:
         rows = np.random.default_rng(0).permutation(60)

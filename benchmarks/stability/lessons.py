@@ -1,7 +1,7 @@
-"""Sums that break plain least squares of knowledge (docs/method.md, section 14): in 60 digits, or
-by what cannot matter.
+"""Sums that break plain least squares of knowledge (docs/method.md, section 14).
 
-Errors are those of answers W z, relative to the largest, unless a case says otherwise.
+The oracle has 60 digits, or is a change that cannot matter. Errors are those of answers W z,
+relative to the largest, unless a case says otherwise.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def order(count: int) -> Outcome:
         lessons(min(count, 20)) * max(count // 20, 1),
     )
     weights = weights[: len(sums)]
-    found, again = (
+    forwards, again = (
         solved(combined(of, by), RIDGE) for of, by in ((sums, weights), (sums[::-1], weights[::-1]))
     )
 
@@ -148,7 +148,7 @@ def order(count: int) -> Outcome:
         )
         return np.linalg.solve(gram + np.float32(RIDGE) * np.diag(np.diag(gram)), cross)
 
-    return beside(found, plainly, again, ANSWERS)
+    return beside(forwards, plainly, again, ANSWERS)
 
 
 NOVEL: dict[str, tuple[Callable[[np.ndarray], np.ndarray], float]] = {
@@ -161,16 +161,14 @@ NOVEL: dict[str, tuple[Callable[[np.ndarray], np.ndarray], float]] = {
 
 @case("novelty of {name}", name=NOVEL)
 def new(name: str) -> Outcome:
-    """ρ beside 0 or 1, where half of the features are known alone; of a scene that is known, ENERGY
-    leaves a tenth.
-    """
+    """ρ beside 0 or 1, half of the features being in the basis; ENERGY leaves a tenth of those."""
     change, exact = NOVEL[name]
     of = scene()
     half = of.features * [1, 1, 1, 0, 0, 0]
-    seen = summed(half, of.meanings, of.weights)
+    first_half = summed(half, of.meanings, of.weights)
     scale = scale_of(summed(*of))
-    given = summed(change(half if exact == 0 else of.features), of.meanings, of.weights)
-    return Outcome(abs(novelty(given, scale, basis(seen, scale)) - exact), 0.1)
+    scene_sums = summed(change(half if exact == 0 else of.features), of.meanings, of.weights)
+    return Outcome(abs(novelty(scene_sums, scale, basis(first_half, scale)) - exact), 0.1)
 
 
 @case("left unexplained, meanings of {size:.0e}", size=[1e-100, 1e-10, 1e10, 1e100])
@@ -184,14 +182,12 @@ def left(size: float) -> Outcome:
         missed = y - (of.features @ solved(sums, RIDGE)).astype(np.float32)
         return float((of.weights @ np.square(missed)).sum() / (of.weights @ np.square(y)).sum())
 
-    found, wanted = (unexplained(each, solved(each, RIDGE)) for each in (sums, exact))
-    return beside(found, plainly, wanted, ANSWERS)
+    ours, expected = (unexplained(each, solved(each, RIDGE)) for each in (sums, exact))
+    return beside(ours, plainly, expected, ANSWERS)
 
 
 class Views(NamedTuple):
-    """What three views say of points on a wall: points [N, 3], depth [V, H, W], features [V, h, w,
-    C], poses.
-    """
+    """Three views of points [N, 3] on a wall: depth [V, H, W], features [V, h, w, C], poses."""
 
     means: np.ndarray
     depth: np.ndarray
@@ -238,10 +234,8 @@ SEEN: dict[str, Callable[[], Views]] = {
 
 
 @case("seen by views, {name}", name=SEEN)
-def seen(name: str) -> Outcome:
-    """Mean unit features of points against point by point; the plain way averages what lies at
-    their pixels, in f16.
-    """
+def mean_features(name: str) -> Outcome:
+    """Mean unit features of points, point by point; plainly, the mean at their pixels, in f16."""
     of = SEEN[name]()
     exact, plain = np.zeros((len(of.means), C)), np.zeros((len(of.means), C), np.float16)
     for i, point in enumerate(of.means):
@@ -252,19 +246,19 @@ def seen(name: str) -> Outcome:
             if not (z > 0 and 0 <= column < 32 and 0 <= row < 24):
                 continue
             plain[i] += features[row, column] / np.float16(3)
-            said = features[row, column].astype(np.float64)
-            if abs(depth[row, column] / of.unit - z) < 0.03 + 0.01 * z and said.any():
-                rows.append(said / np.linalg.norm(said))
+            feature = features[row, column].astype(np.float64)
+            if abs(depth[row, column] / of.unit - z) < 0.03 + 0.01 * z and feature.any():
+                rows.append(feature / np.linalg.norm(feature))
         exact[i] = np.mean(rows, 0) if rows else 0
-    found, _ = averaged(
+    ours, _ = averaged(
         of.means, of.depth, of.features, C, np.tile(VIEW_K, (3, 1, 1)), of.poses, unit=of.unit
     )
-    return beside(found, lambda: plain, exact, 1e-5)
+    return beside(ours, lambda: plain, exact, 1e-5)
 
 
 @case("odds of {n} points, one of a label of its own", n=[2, 1000, 1_000_000])
 def rare(n: int) -> Outcome:
-    """That one's odds against the formula."""
+    """Odds of that one against the formula."""
     labels, views = np.zeros(n, np.int64), np.full(n, 2)
     labels[-1] = 1
     exact = 0.5 / n + 0.5 / (1 + (n - 1) / np.sqrt(n - 1))

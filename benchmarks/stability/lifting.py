@@ -1,6 +1,4 @@
-"""Views and votes that break plain averages of what views say of Gaussians (docs/method.md, section
-12).
-"""
+"""Views and votes that break plain averages of views by Gaussian (docs/method.md, section 12)."""
 
 from __future__ import annotations
 
@@ -19,8 +17,8 @@ VIEW = 1e-4  # float32 weights of what makes up a hundredth of a view, and more
 VOTES = 1e-5  # float32 results of vectors that cancel to a tenth
 
 
-class Said(NamedTuple):
-    """What the cells of a view say, of Gaussians in these units and so far from the origin."""
+class CellMap(NamedTuple):
+    """Values and counts of a view's cells, and the unit and the shift of its Gaussians."""
 
     values: np.ndarray
     counts: np.ndarray
@@ -28,36 +26,38 @@ class Said(NamedTuple):
     shift: float = 0.0
 
 
-def said(size: float = 1.0, counts: Any = 1.0, hole: float | None = None, **place: float) -> Said:
-    """Noise; hole: what the third of the cells that counts nothing holds."""
+def cell_map(
+    size: float = 1.0, counts: Any = 1.0, hole: float | None = None, **place: float
+) -> CellMap:
+    """Noise; hole: value of a third of the cells, which count nothing."""
     values = (size * np.random.default_rng(0).normal(size=(*CELLS, CHANNELS))).astype(np.float32)
-    seen = Said(values, np.broadcast_to(counts, CELLS).astype(np.float32), **place)
+    cells = CellMap(values, np.broadcast_to(counts, CELLS).astype(np.float32), **place)
     if hole is not None:
-        seen.counts[::3], seen.values[::3] = 0, hole
-    return seen
+        cells.counts[::3], cells.values[::3] = 0, hole
+    return cells
 
 
-VIEWS: dict[str, Callable[[], Said]] = {
-    "values of 1e-30": lambda: said(1e-30),
-    "values of 1e+30": lambda: said(1e30),
-    "counts of 1e-30": lambda: said(counts=1e-30),
-    "counts of 1e+30": lambda: said(counts=1e30),
-    "values of 1e-20, counts of 1e-20": lambda: said(1e-20, 1e-20),
-    "counts of 1e-15 to 1e+15": lambda: said(counts=np.geomspace(1e-15, 1e15, 70).reshape(CELLS)),
-    "nothing counts": lambda: said(counts=0.0),
-    "NaN where nothing counts": lambda: said(hole=np.nan),
-    "inf where nothing counts": lambda: said(hole=np.inf),
-    "one cell counts": lambda: said(counts=np.eye(1, 70, 34).reshape(CELLS)),
-    "units of 1e+03": lambda: said(unit=1e3),
-    "1e+04 from the origin": lambda: said(shift=1e4),
+VIEWS: dict[str, Callable[[], CellMap]] = {
+    "values of 1e-30": lambda: cell_map(1e-30),
+    "values of 1e+30": lambda: cell_map(1e30),
+    "counts of 1e-30": lambda: cell_map(counts=1e-30),
+    "counts of 1e+30": lambda: cell_map(counts=1e30),
+    "values of 1e-20, counts of 1e-20": lambda: cell_map(1e-20, 1e-20),
+    "counts of 1e-15 to 1e+15": lambda: cell_map(
+        counts=np.geomspace(1e-15, 1e15, 70).reshape(CELLS)
+    ),
+    "nothing counts": lambda: cell_map(counts=0.0),
+    "NaN where nothing counts": lambda: cell_map(hole=np.nan),
+    "inf where nothing counts": lambda: cell_map(hole=np.inf),
+    "one cell counts": lambda: cell_map(counts=np.eye(1, 70, 34).reshape(CELLS)),
+    "units of 1e+03": lambda: cell_map(unit=1e3),
+    "1e+04 from the origin": lambda: cell_map(shift=1e4),
 }
 
 
 @case("a view, {name}", name=VIEWS)
 def of_a_view(name: str) -> Outcome:
-    """Mean of what is said of each Gaussian, against float64 at every pixel; the plain way weighs
-    all cells alike.
-    """
+    """Mean value of each Gaussian against float64 at every pixel; plainly, all cells are alike."""
     values, counts, unit, shift = VIEWS[name]()
     means, quats, scales, opacities, _ = (part.numpy() for part in gaussians().values())
     pose = np.eye(4)
@@ -69,12 +69,12 @@ def of_a_view(name: str) -> Outcome:
         opacities,
     )
     camera = pose, K.double().numpy(), (WIDTH, HEIGHT)
-    found = lift.lift(parts, *camera, values, counts)
+    lifted = lift.lift(parts, *camera, values, counts)
     ours, (weights, sums) = (
         np.zeros((len(means), CHANNELS + 1)),
         reference.lift(parts, *camera, values, counts),
     )
-    ours[found.ids] = np.column_stack([found.weights, found.sums])
+    ours[lifted.ids] = np.column_stack([lifted.weights, lifted.sums])
     heard = weights > 1e-2 * weights.max()
 
     def plainly() -> np.ndarray:
@@ -94,7 +94,7 @@ def of_a_view(name: str) -> Outcome:
     )
 
 
-SAID: dict[str, Callable[[np.ndarray, np.ndarray], object]] = {
+SPOILED_MAPS: dict[str, Callable[[np.ndarray, np.ndarray], object]] = {
     "as it is": lambda values, counts: None,
     "half NaN": lambda values, counts: values[::2, 1:].fill(np.nan),
     "half infinite, half counts nothing": lambda values, counts: (
@@ -112,25 +112,26 @@ SAID: dict[str, Callable[[np.ndarray, np.ndarray], object]] = {
 }
 
 
-@case("cells of a map of {size}, {name}", size=[(1, 1), (5, 3), (7, 10), (28, 40)], name=SAID)
+@case(
+    "cells of a map of {size}, {name}", size=[(1, 1), (5, 3), (7, 10), (28, 40)], name=SPOILED_MAPS
+)
 def cells(size: tuple[int, int], name: str) -> Outcome:
-    """Means by area over what is said and finite, and how much that is, each over its largest,
-    against pieces that entries and cells both consist of; the plain way takes the entry at a cell's
-    middle.
+    """Means by area of finite, non-zero entries, and their counts, each over its largest, against
+    pieces that entries and cells both consist of; the plain way takes the entry at a cell's middle.
     """
     rng = np.random.default_rng(3)
     values, counts = (
         rng.normal(size=(*size, CHANNELS)).astype(np.float32),
         rng.uniform(1, 2, size).astype(np.float32),
     )
-    SAID[name](values, counts)
-    told = np.isfinite(values).all(-1) & values.any(-1)
+    SPOILED_MAPS[name](values, counts)
+    usable = np.isfinite(values).all(-1) & values.any(-1)
     rows, columns = (
         np.arange(np.lcm(pixels, n)) * n // np.lcm(pixels, n)
         for pixels, n in zip((HEIGHT, WIDTH), size, strict=True)
     )
-    weights = np.where(told, counts, 0).astype(np.float64)[np.ix_(rows, columns)]
-    pieces = np.where(told[..., None], values, 0).astype(np.float64)[np.ix_(rows, columns)]
+    weights = np.where(usable, counts, 0).astype(np.float64)[np.ix_(rows, columns)]
+    pieces = np.where(usable[..., None], values, 0).astype(np.float64)[np.ix_(rows, columns)]
     shape = CELLS[0], len(rows) // CELLS[0], CELLS[1], len(columns) // CELLS[1]
     share = weights.reshape(shape).mean((1, 3))
     sums = (pieces * weights[..., None]).reshape(*shape, CHANNELS).mean((1, 3))
@@ -142,9 +143,9 @@ def cells(size: tuple[int, int], name: str) -> Outcome:
         )
         return values[index], counts[index]
 
-    def apart(found: tuple[np.ndarray, ...], exact: tuple[np.ndarray, ...]) -> float:
+    def apart(ours: tuple[np.ndarray, ...], exact: tuple[np.ndarray, ...]) -> float:
         there = exact[1] > 0
-        return max(relative(found[0][there], exact[0][there]), relative(found[1], exact[1]))
+        return max(relative(ours[0][there], exact[0][there]), relative(ours[1], exact[1]))
 
     return beside(to_cells(values, counts, (WIDTH, HEIGHT)), plainly, exact, VOTES, apart)
 
@@ -194,9 +195,7 @@ ESTIMATES: dict[str, Callable[[], Votes]] = {
 
 
 def median(of: Votes, dtype: type, floor: float) -> np.ndarray:
-    """STEPS of Weiszfeld's from the weighted mean of the directions, then the mean by its weights,
-    [G, C].
-    """
+    """STEPS of Weiszfeld's from the weighted mean of directions, then the weighted mean, [G, C]."""
     w, b = (part.astype(dtype) for part in of)
     lengths = np.sqrt((b * b).sum(-1))
     directions = b / (np.maximum(lengths, 1e-12) if floor else lengths)[..., None]
@@ -213,16 +212,14 @@ def median(of: Votes, dtype: type, floor: float) -> np.ndarray:
 
 @case("an estimate, {name}", name=ESTIMATES)
 def estimates(name: str) -> Outcome:
-    """Features against 80 bits; the plain way has no bound to what one view takes, and divides by
-    every length.
-    """
+    """Features against 80 bits; the plain way bounds no view and divides by every length."""
     of = ESTIMATES[name]()
     n, n_views = of.weights.shape
     rows = np.tile(np.arange(n_views, dtype=np.int32), n)
-    given = Observations(
+    observations = Observations(
         np.arange(n + 1) * n_views, rows, of.weights.ravel(), of.means.reshape(-1, CHANNELS)
     )
     exact = median(of, np.longdouble, NEAREST)
     return beside(
-        estimate(given, STEPS).features, lambda: median(of, np.float32, 0.0), exact, VOTES
+        estimate(observations, STEPS).features, lambda: median(of, np.float32, 0.0), exact, VOTES
     )

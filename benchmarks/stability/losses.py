@@ -25,7 +25,7 @@ def normal(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-class Seen(NamedTuple):
+class LabelledView(NamedTuple):
     """A view: its render, and labels of cells of 2 x 2 pixels."""
 
     render: Tensor
@@ -34,32 +34,34 @@ class Seen(NamedTuple):
     mask: Tensor | None = None
 
 
-def seen(
+def labelled_view(
     size: float = 1.0, n_classes: int = CLASSES, confidence: float = 1.0, unlabelled: bool = False
-) -> Seen:
+) -> LabelledView:
     g = torch.Generator().manual_seed(1)
     classes = torch.randint(n_classes, (HEIGHT // 2, WIDTH // 2), generator=g)
     certainty = confidence * torch.rand(classes.shape, generator=g)
     labels = TaughtLabels(classes - 10 * unlabelled, certainty, normal(n_classes, CHANNELS, seed=2))
-    return Seen(size * normal(HEIGHT, WIDTH, CHANNELS), labels)
+    return LabelledView(size * normal(HEIGHT, WIDTH, CHANNELS), labels)
 
 
-VIEWS: dict[str, Callable[[], Seen]] = {
-    "no votes at all": lambda: seen(unlabelled=True),
-    "confidence 0": lambda: seen(confidence=0.0),
-    "confidence 1e-30": lambda: seen(confidence=1e-30),
-    "nothing counts": lambda: seen()._replace(mask=torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)),
-    "one class": lambda: seen(n_classes=1),
-    "logits of 0": lambda: seen(0.0),
-    "logits of 1e-20": lambda: seen(1e-20),
-    "logits of 1e20": lambda: seen(1e20),
-    "logits of 1e20, one class": lambda: seen(1e20, n_classes=1),
-    "temperature 1e-3": lambda: seen()._replace(temperature=1e-3),
-    "temperature 1e6": lambda: seen()._replace(temperature=1e6),
+VIEWS: dict[str, Callable[[], LabelledView]] = {
+    "no votes at all": lambda: labelled_view(unlabelled=True),
+    "confidence 0": lambda: labelled_view(confidence=0.0),
+    "confidence 1e-30": lambda: labelled_view(confidence=1e-30),
+    "nothing counts": lambda: labelled_view()._replace(
+        mask=torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    ),
+    "one class": lambda: labelled_view(n_classes=1),
+    "logits of 0": lambda: labelled_view(0.0),
+    "logits of 1e-20": lambda: labelled_view(1e-20),
+    "logits of 1e20": lambda: labelled_view(1e20),
+    "logits of 1e20, one class": lambda: labelled_view(1e20, n_classes=1),
+    "temperature 1e-3": lambda: labelled_view()._replace(temperature=1e-3),
+    "temperature 1e6": lambda: labelled_view()._replace(temperature=1e6),
 }
 
 
-def exact_entropy(view: Seen) -> float:
+def exact_entropy(view: LabelledView) -> float:
     """In 60 digits, cell by cell."""
     if view.mask is not None:
         return 0.0

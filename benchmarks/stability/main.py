@@ -1,6 +1,4 @@
-"""Every stiff and extreme case of the maths: the plain way's error, ours beside its tolerance, pass
-or fail.
-"""
+"""Every stiff and extreme case of the maths: errors of the plain way and of ours, and a verdict."""
 
 from __future__ import annotations
 
@@ -40,14 +38,14 @@ def main(arguments: Sequence[str]) -> int:
     parser = shared.parser("stability", __doc__)
     parser.add_argument("--only", default="", help="run cases whose `module: name` holds this text")
     options = parser.parse_args(arguments)
-    chosen = [key for key in CASES if options.only in f"{key[0]}: {key[1]}"]
-    if not chosen:
+    keys = [key for key in CASES if options.only in f"{key[0]}: {key[1]}"]
+    if not keys:
         print(f"no case is called {options.only!r}", file=sys.stderr)
         return 2
     torch.set_num_threads(1)  # matrices this small wait longer for threads than they compute
     print(shared.machine())
     rows = []
-    for key in chosen:
+    for key in keys:
         row = run(key)
         rows.append(row)
         verdict = "pass" if row.passed else f"FAIL  {row.note}"

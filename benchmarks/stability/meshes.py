@@ -1,5 +1,4 @@
-"""Depth that breaks plain triangles, and meshes that are hard to measure (docs/usage.md, `chebsplat
-mesh`).
+"""Depth that breaks plain triangles, and meshes hard to measure (docs/usage.md, `chebsplat mesh`).
 
 Errors of a mesh are its vertices' distances from the true surface, in voxels.
 """
@@ -12,8 +11,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from benchmarks.stability.case import Outcome, beside, case
-from chebsplat.formats.meshes import Frame, Mesh, fused
-from chebsplat.stages.tools.mesh import away, without_edges
+from chebsplat.formats.meshes import Frame, Mesh, fuse_depth
+from chebsplat.stages.tools.mesh import away, drop_edges
 from chebsplat.synthetic.rays import open3d
 
 HEIGHT, WIDTH, VOXEL, WALL = 30, 40, 0.05, 2.0
@@ -23,13 +22,13 @@ NEAR = 0.02  # voxels: a plane is where a distance is 0 between two of them
 
 def frames(unit: float = 1.0, shift: float = 0.0, n: int = 6) -> list[Frame]:
     """A red wall at z = 2 from places side by side, `shift` so far from the origin."""
-    made = []
+    views = []
     for view in range(n):
         pose = np.eye(4)
         pose[:3, 3] = -unit * np.array([0.03 * view, 0, 0]) - shift
         color = np.full((HEIGHT, WIDTH, 3), (200, 40, 90), np.uint8)
-        made.append(Frame(np.full((HEIGHT, WIDTH), unit * WALL, np.float32), color, K, pose))
-    return made
+        views.append(Frame(np.full((HEIGHT, WIDTH), unit * WALL, np.float32), color, K, pose))
+    return views
 
 
 def spoiled(value: float, views: slice = np.s_[:], rows: slice = np.s_[:10]) -> list[Frame]:
@@ -61,26 +60,24 @@ WALLS: dict[str, Callable[[], tuple[list[Frame], float, float]]] = {
 
 @case("a wall {name}", name=WALLS)
 def walls(name: str) -> Outcome:
-    """Raises ValueError where there is no mesh. The plain way takes each pixel for a vertex, as it
-    is, in float32.
-    """
+    """Raises ValueError without a mesh. The plain way takes each pixel for a vertex, in float32."""
     of, unit, shift = WALLS[name]()
-    made = fused(open3d(), of, unit * VOXEL, 10 * unit)
-    if len(made.triangles) < 500 or (made.colors != made.colors[0]).any():
-        raise ValueError(f"{len(made.triangles)} triangles, or of another colour")
+    mesh = fuse_depth(open3d(), of, unit * VOXEL, 10 * unit)
+    if len(mesh.triangles) < 500 or (mesh.colors != mesh.colors[0]).any():
+        raise ValueError(f"{len(mesh.triangles)} triangles, or of another colour")
 
     def plainly() -> np.ndarray:
         depth = np.concatenate([frame.depth.ravel() for frame in of])
         return (depth - np.float32(of[0].pose[2, 3])).astype(np.float32)
 
-    def off(found: np.ndarray, exact: float) -> float:
+    def off(ours: np.ndarray, exact: float) -> float:
         return (
-            float(np.abs(found - exact).max() / (unit * VOXEL))
-            if np.isfinite(found).all()
+            float(np.abs(ours - exact).max() / (unit * VOXEL))
+            if np.isfinite(ours).all()
             else float("inf")
         )
 
-    return beside(made.vertices[:, 2], plainly, unit * WALL + shift, NEAR, off)
+    return beside(mesh.vertices[:, 2], plainly, unit * WALL + shift, NEAR, off)
 
 
 EMPTY: dict[str, Callable[[], list[Frame]]] = {
@@ -94,9 +91,9 @@ EMPTY: dict[str, Callable[[], list[Frame]]] = {
 
 @case("empty, {name}", name=EMPTY)
 def empty(name: str) -> Outcome:
-    """How many vertices there are."""
-    made = fused(open3d(), EMPTY[name](), VOXEL, 10.0)
-    return Outcome(float(len(made.vertices) + len(made.triangles)), 0.0)
+    """Number of vertices and triangles."""
+    mesh = fuse_depth(open3d(), EMPTY[name](), VOXEL, 10.0)
+    return Outcome(float(len(mesh.vertices) + len(mesh.triangles)), 0.0)
 
 
 @case(
@@ -105,20 +102,18 @@ def empty(name: str) -> Outcome:
     hole=[0.0, np.nan],
 )
 def edges(unit: float, hole: float) -> Outcome:
-    """Pixels that are kept of two walls, a step between them, a hole in one; the plain way takes a
-    step in units.
-    """
+    """Pixels left of two walls, a step between them, a hole in one; plainly, steps are in units."""
     depth = np.full((12, 16), 2.0)
     depth[:, 8:], depth[4:6, 2:4] = 3.0, hole
     exact = np.where(depth > 0, depth, 0)
     exact[:, 7:9] = 0
-    given = (unit * depth).astype(np.float32)
+    measured = (unit * depth).astype(np.float32)
 
     def plainly() -> np.ndarray:
-        far = np.abs(np.diff(given, axis=1, append=given[:, -1:])) > 0.1
-        return np.where(far | np.roll(far, 1, 1), 0, given) / np.float32(unit)
+        far = np.abs(np.diff(measured, axis=1, append=measured[:, -1:])) > 0.1
+        return np.where(far | np.roll(far, 1, 1), 0, measured) / np.float32(unit)
 
-    return beside(without_edges(given) / np.float32(unit), plainly, exact, 1e-6)
+    return beside(drop_edges(measured) / np.float32(unit), plainly, exact, 1e-6)
 
 
 def ball(n: int = 40) -> Mesh:
@@ -143,9 +138,7 @@ def ball(n: int = 40) -> Mesh:
 
 @case("how far points are from a ball of {radius:.0e}", radius=[1e-6, 1.0, 1e6])
 def distances(radius: float) -> Outcome:
-    """Of points at 1.5 radii, over the radius; the plain way takes the nearest vertex of two
-    triangles as large.
-    """
+    """Of points at 1.5 radii, over the radius; plainly, to the nearest vertex of a coarse ball."""
     of, points = ball(), np.random.default_rng(0).normal(size=(500, 3))
     points *= 1.5 * radius / np.linalg.norm(points, axis=1, keepdims=True)
     mesh = of._replace(vertices=np.float32(radius) * of.vertices)

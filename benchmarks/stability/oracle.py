@@ -1,6 +1,4 @@
-"""The descriptor in 60 digits, straight from its definition: no logarithms, no shortcut of the
-recurrence.
-"""
+"""The descriptor in 60 digits, straight from its definition: no logarithms, no shortcuts."""
 
 from __future__ import annotations
 
@@ -28,9 +26,7 @@ def describe(
     anisotropy: float = 10.0,
     bandwidth: float = 0.7,
 ) -> np.ndarray:
-    """One region without padding, [n, 3], [n, 3], [n, 3, 3] -> [n, J, D - 1], rounded to float64 at
-    the end.
-    """
+    """One region without padding, [n, 3], [n, 3], [n, 3, 3] -> [n, J, D - 1], as float64."""
     n = len(means)
     if n == 0:
         return np.zeros((0, n_angles, max_degree - 1))
@@ -46,8 +42,11 @@ def describe(
             0, 2, 1
         )
         around, certainty = _axis(c, s, R)
-        angles = [_diagonals(_similarity(c, factors, _rotation(around, j, n_angles), bandwidth), max_degree) * n
-                  for j in range(n_angles)]  # fmt: skip
+        rotations = [_rotation(around, j, n_angles) for j in range(n_angles)]
+        angles = [
+            _diagonals(_similarity(c, factors, rotation, bandwidth), max_degree) * n
+            for rotation in rotations
+        ]
         out = [angles[0]]
         for j in range(1, n_angles):
             a, b = angles[min(j, n_angles - j)], angles[max(j, n_angles - j)]

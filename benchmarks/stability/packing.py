@@ -1,5 +1,4 @@
-"""Gaussians that break plain quantisation for pages, and places that float32 files round
-(docs/usage.md, `chebsplat page`).
+"""Gaussians that break plain quantisation (docs/usage.md, `chebsplat page`) and float32 files.
 
 Errors are of all Gaussians but the odd one that a case is named for.
 """
@@ -25,7 +24,7 @@ ODD = 3  # the Gaussian that is not like the others
 def room(n: int = N, **changes: Callable[[np.ndarray], object]) -> Parameters:
     """Gaussians of 5 to 50 mm in a room of 5 m; changes are made in place."""
     rng = np.random.default_rng(0)
-    made = {
+    raw = {
         "means": rng.uniform(0, 5, (n, 3)),
         "log_scales": np.log(rng.uniform(0.005, 0.05, (n, 3))),
         "quats": rng.normal(size=(n, 4)),
@@ -34,10 +33,10 @@ def room(n: int = N, **changes: Callable[[np.ndarray], object]) -> Parameters:
         "shN": rng.normal(size=(n, 15, 3)),
         "features": rng.normal(size=(n, 8)),
     }
-    made = {name: values.astype(np.float32) for name, values in made.items()}
+    raw = {name: values.astype(np.float32) for name, values in raw.items()}
     for name, change in changes.items():
-        change(made[name])
-    return made
+        change(raw[name])
+    return raw
 
 
 def others(values: np.ndarray) -> np.ndarray:
@@ -67,9 +66,7 @@ SCALES: dict[str, Callable[[], Parameters]] = {
 
 @case("scales, {name}", name=SCALES)
 def scales(name: str) -> Outcome:
-    """Of each Gaussian's longest axis, relative: 8 bits of logarithms; the plain way cuts off e^10
-    below the largest.
-    """
+    """Longest axes, relative: 8 bits of logarithms; plainly, cut off e^10 below the largest."""
     of = SCALES[name]()
 
     def longest(log_scales: np.ndarray) -> np.ndarray:
@@ -78,11 +75,9 @@ def scales(name: str) -> Outcome:
     def plainly() -> np.ndarray:
         return longest(eight_bits(of["log_scales"].clip(of["log_scales"].max() - np.float32(10.2))))
 
-    def apart(found: np.ndarray, exact: np.ndarray) -> float:
+    def apart(ours: np.ndarray, exact: np.ndarray) -> float:
         return (
-            float(np.expm1(np.abs(found - exact)).max())
-            if np.isfinite(found).all()
-            else float("inf")
+            float(np.expm1(np.abs(ours - exact)).max()) if np.isfinite(ours).all() else float("inf")
         )
 
     return beside(
@@ -105,57 +100,55 @@ def places(name: str) -> Outcome:
     """The largest distance in scene units; the plain way has 16 bits of the range."""
     of, tolerance = PLACES[name][0](), PLACES[name][1]
 
-    def kept(means: np.ndarray) -> np.ndarray:
+    def compared(means: np.ndarray) -> np.ndarray:
         return others(means) if len(means) > 1 else means
 
     def plainly() -> np.ndarray:
         low, step = of["means"].min(0), np.ptp(of["means"], 0) / np.float32(65535)
-        return kept(np.round((of["means"] - low) / step) * step + low)
+        return compared(np.round((of["means"] - low) / step) * step + low)
 
-    def apart(found: np.ndarray, exact: np.ndarray) -> float:
+    def apart(ours: np.ndarray, exact: np.ndarray) -> float:
         return (
-            float(np.abs(found.astype(float) - exact).max())
-            if np.isfinite(found).all()
+            float(np.abs(ours.astype(float) - exact).max())
+            if np.isfinite(ours).all()
             else float("inf")
         )
 
-    return beside(kept(unpack(pack(of))["means"]), plainly, kept(of["means"]), tolerance, apart)
+    return beside(
+        compared(unpack(pack(of))["means"]), plainly, compared(of["means"]), tolerance, apart
+    )
 
 
 @case("a Gaussian that is seen at {at:.0e}", at=[1e4, 1e6, 1e18])
 def far(at: float) -> Outcome:
-    """Direction from the middle, and size over distance, relative; the plain way clips coordinates
-    at a thousand rooms.
-    """
+    """Direction from the middle, size over distance; plainly, coordinates are clipped."""
     of = room(means=lambda v: v[ODD].__imul__([at, -at, 2 * at]), log_scales=odd(np.log(0.01 * at)))
     middle = np.median(of["means"].astype(np.float64), 0)
 
-    def seen(means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
+    def appearance(means: np.ndarray, log_scales: np.ndarray) -> np.ndarray:
         away = means[ODD].astype(np.float64) - middle
         distance = np.linalg.norm(away)
         return np.append(away / distance, np.exp(log_scales[ODD].astype(np.float64)) / distance)
 
     def plainly() -> np.ndarray:
-        return seen(of["means"].clip(-5000, 5000), of["log_scales"])
+        return appearance(of["means"].clip(-5000, 5000), of["log_scales"])
 
-    found = unpack(pack(of))
-    exact = seen(of["means"], of["log_scales"])
-    return beside(seen(found["means"], found["log_scales"]), plainly, exact, 0.04)
+    unpacked = unpack(pack(of))
+    exact = appearance(of["means"], of["log_scales"])
+    return beside(appearance(unpacked["means"], unpacked["log_scales"]), plainly, exact, 0.04)
 
 
 @case("quaternions of length {length:.0e}", length=[1e-30, 1e-10, 1.0, 1e10, 1e30])
 def quaternions(length: float) -> Outcome:
-    """Angles between, rad; the plain way has 8 bits an entry of what float32 makes a unit
-    quaternion.
-    """
+    """Angles between, rad; the plain way has 8 bits an entry of float32's unit quaternion."""
     of = room(quats=lambda v: np.multiply(v, length, out=v))
 
-    def angles(found: np.ndarray, exact: np.ndarray) -> float:
-        if not np.isfinite(found).all():
+    def angles(ours: np.ndarray, exact: np.ndarray) -> float:
+        if not np.isfinite(ours).all():
             return float("inf")
         a, b = (
             v / np.linalg.norm(v, axis=1, keepdims=True)
-            for v in (found.astype(float), exact.astype(float))
+            for v in (ours.astype(float), exact.astype(float))
         )
         return float(2 * np.arccos(np.abs((a * b).sum(1)).clip(0, 1)).max())
 
@@ -178,10 +171,8 @@ SHOWN: dict[str, Callable[[], Parameters]] = {
 
 
 @case("what is shown, {name}", name=SHOWN)
-def shown(name: str) -> Outcome:
-    """Opacities and colours of a pixel, in [0, 1]: a step of 4 / 255 at most; the plain way
-    quantises what is stored.
-    """
+def pixel_values(name: str) -> Outcome:
+    """Opacities and colours of a pixel, in [0, 1]; the plain way quantises what is stored."""
     of = SHOWN[name]()
 
     def pixels(logits: np.ndarray, sh0: np.ndarray) -> np.ndarray:
@@ -190,13 +181,15 @@ def shown(name: str) -> Outcome:
             [others(opacity), others(sh0[:, 0].astype(float) * C0 + 0.5).clip(0, 1)]
         )
 
-    found = unpack(pack(of))
-    given = of["logit_opacities"], of["sh0"]
+    unpacked = unpack(pack(of))
+    stored = of["logit_opacities"], of["sh0"]
 
     def plainly() -> np.ndarray:
-        return pixels(*map(eight_bits, given))
+        return pixels(*map(eight_bits, stored))
 
-    return beside(pixels(found["logit_opacities"], found["sh0"]), plainly, pixels(*given), 0.01)
+    return beside(
+        pixels(unpacked["logit_opacities"], unpacked["sh0"]), plainly, pixels(*stored), 0.01
+    )
 
 
 WORLDS = {
@@ -211,9 +204,7 @@ WORLDS = {
 
 @case("a PLY of a world {name}", name=WORLDS)
 def files(name: str) -> Outcome:
-    """Places and sizes as they were, relative to the room; the plain way writes the source's
-    coordinates as float32.
-    """
+    """Places and sizes over the room's; plainly, the source's coordinates become float32."""
     origin, scale = WORLDS[name]
     of, world = (
         room() | {"degrees": np.full(N, 3, np.uint8)},
@@ -221,11 +212,11 @@ def files(name: str) -> Outcome:
     )
     with tempfile.TemporaryDirectory() as folder:
         write_ply(Path(folder) / "room.ply", of, 3, world=world)
-        found, _, _ = read_ply(Path(folder) / "room.ply", world)
+        loaded, _, _ = read_ply(Path(folder) / "room.ply", world)
 
     def plainly() -> np.ndarray:
         return world.inward(world.outward(of["means"]).astype(np.float32))
 
-    outcome = beside(found["means"], plainly, of["means"], 2e-6)
-    sizes = relative(np.exp(found["log_scales"]), np.exp(of["log_scales"]))
+    outcome = beside(loaded["means"], plainly, of["means"], 2e-6)
+    sizes = relative(np.exp(loaded["log_scales"]), np.exp(of["log_scales"]))
     return outcome._replace(error=max(outcome.error, sizes))

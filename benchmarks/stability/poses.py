@@ -1,5 +1,4 @@
-"""Poses that break the plain way from one world to another, as adjusted poses go (docs/method.md,
-section 1).
+"""Poses that break the plain way from one world to another (docs/method.md, section 1).
 
 Errors are the largest of that of the scale, of the rotation's entries and of places over the
 cameras' spread.
@@ -29,12 +28,10 @@ TURN = Rotation.from_rotvec([0.3, -2.0, 0.7]).as_matrix()
 
 
 class Worlds(NamedTuple):
-    """Poses [V, 4, 4] of the same cameras in two worlds, and the similarity from the first to the
-    second.
-    """
+    """Poses [V, 4, 4] of the same cameras in two worlds; way: from the first to the second."""
 
-    found: np.ndarray
-    given: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
     way: Similarity
 
 
@@ -46,21 +43,21 @@ def worlds(
     n: int = VIEWS,
 ) -> Worlds:
     """Cameras that look everywhere, `at` so far from the first world's origin."""
-    rng, found = np.random.default_rng(0), np.tile(np.eye(4), (n, 1, 1))
-    found[:, :3, :3] = Rotation.random(n, rng=rng).as_matrix()
-    found[:, :3, 3] = -np.einsum(
-        "vij,vj->vi", found[:, :3, :3], rng.normal(size=(n, 3)) * spread + at
+    rng, first = np.random.default_rng(0), np.tile(np.eye(4), (n, 1, 1))
+    first[:, :3, :3] = Rotation.random(n, rng=rng).as_matrix()
+    first[:, :3, 3] = -np.einsum(
+        "vij,vj->vi", first[:, :3, :3], rng.normal(size=(n, 3)) * spread + at
     )
     way = Similarity(scale, TURN, np.array([1.0, -2.0, 0.5]) * shift)
-    return Worlds(found, way.of_cameras(found), way)
+    return Worlds(first, way.of_cameras(first), way)
 
 
 def astray(share: float, by: float) -> Worlds:
-    """So many of the given poses are moved."""
+    """So many of the second poses are moved."""
     of = worlds()
-    given = of.given.copy()
-    given[: round(share * VIEWS), :3, 3] += by
-    return of._replace(given=given)
+    second = of.second.copy()
+    second[: round(share * VIEWS), :3, 3] += by
+    return of._replace(second=second)
 
 
 def one_place() -> Worlds:
@@ -82,13 +79,15 @@ WORLDS: dict[str, Callable[[], Worlds]] = {
 }
 
 
-def differ(found: Similarity, of: Worlds) -> float:
+def differ(similarity: Similarity, of: Worlds) -> float:
     """Of scale, rotation, and of places in the second world."""
-    there = centers(of.given)
+    there = centers(of.second)
     spread = max(float(np.abs(there - there.mean(0)).max()), 1e-6 * float(np.abs(there).max()))
-    apart = np.abs(found.of_points(centers(of.found)) - there).max() / spread
+    apart = np.abs(similarity.of_points(centers(of.first)) - there).max() / spread
     return max(
-        relative(found.scale, of.way.scale), relative(found.rotation, of.way.rotation), float(apart)
+        relative(similarity.scale, of.way.scale),
+        relative(similarity.rotation, of.way.rotation),
+        float(apart),
     )
 
 
@@ -98,24 +97,22 @@ def aligned(name: str) -> Outcome:
     of = WORLDS[name]()
 
     def plainly() -> Similarity:
-        return fitted(centers(of.found).astype(np.float32), centers(of.given).astype(np.float32))
+        return fitted(centers(of.first).astype(np.float32), centers(of.second).astype(np.float32))
 
     tolerance = 1e-8 if "1e+06 from" in name else EXACT  # of places, which float64 rounds by 1e-10
-    return beside(Similarity(*alignment(of.found, of.given)), plainly, of, tolerance, differ)
+    return beside(Similarity(*alignment(of.first, of.second)), plainly, of, tolerance, differ)
 
 
 @case("{share:.0%} of the poses astray by {by:.0e}", share=[0.05, 0.3], by=[1.0, 1e6])
 def lost(share: float, by: float) -> Outcome:
-    """The frame of the others; the plain way aligns all. Raises ValueError where others than these
-    are left out.
-    """
+    """The frame of the others; plainly, of all. ValueError if others than these are left out."""
     of, true = astray(share, by), worlds()
-    found = frame(of.found, of.given, np.ones(VIEWS, bool))
-    if not np.array_equal(found.led, np.arange(VIEWS) >= round(share * VIEWS)):
-        raise ValueError(f"{found.led.sum()} views are believed")
+    fit = frame(of.first, of.second, np.ones(VIEWS, bool))
+    if not np.array_equal(fit.led, np.arange(VIEWS) >= round(share * VIEWS)):
+        raise ValueError(f"{fit.led.sum()} views are believed")
     return beside(
-        Similarity(*found[:3]),
-        lambda: Similarity(*alignment(of.found, of.given)),
+        Similarity(*fit[:3]),
+        lambda: Similarity(*alignment(of.first, of.second)),
         true,
         EXACT,
         differ,
@@ -161,9 +158,7 @@ ADJUSTED: dict[str, tuple[Similarity, float, float]] = {
 
 @case("adjusted to photos, {name}", name=ADJUSTED)
 def adjusted(name: str) -> Outcome:
-    """Mean distance of centres from the true ones, in the mean distance from their middle; the
-    plain way keeps poses.
-    """
+    """Mean distance of centres from the true ones, over their spread; plainly, poses stay."""
     (way, share, focal), rng = ADJUSTED[name], np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as root:
         folder, database = Path(root), Path(root) / "database.db"
@@ -171,22 +166,22 @@ def adjusted(name: str) -> Outcome:
         model = photographed(database)
         names, exact = [image.name for image in images_of(model)], way.of_cameras(posed(model))
         size = np.linalg.norm(centers(exact) - centers(exact).mean(0), axis=1).mean()
-        given = exact.copy()
+        disturbed = exact.copy()
         turns = Rotation.from_rotvec(0.5 * share * rng.normal(size=(len(names), 3))).as_matrix()
         places = centers(exact) + share * size * rng.normal(size=(len(names), 3))
-        given[:, :3, :3] = turns @ exact[:, :3, :3]
-        given[:, :3, 3] = -np.einsum("vij,vj->vi", given[:, :3, :3], places)
+        disturbed[:, :3, :3] = turns @ exact[:, :3, :3]
+        disturbed[:, :3, 3] = -np.einsum("vij,vj->vi", disturbed[:, :3, :3], places)
         job = Job({}, Config(), folder / "out", folder)
-        for image, pose in zip(images_of(model), given, strict=True):
+        for image, pose in zip(images_of(model), disturbed, strict=True):
             image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose[:3]))
             image.camera.params = [focal, focal, 512, 384]
-        found = posed(adjust(job, model, database, names, given)[0])
+        refined = posed(adjust(job, model, database, names, disturbed)[0])
 
     def off(poses: np.ndarray, exact: np.ndarray) -> float:
         there = Similarity(*alignment(poses, exact)).of_points(centers(poses))
         return float(np.linalg.norm(there - centers(exact), axis=1).mean() / size)
 
-    return beside(found, lambda: given, exact, 2e-3, off)
+    return beside(refined, lambda: disturbed, exact, 2e-3, off)
 
 
 POINTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -212,5 +207,5 @@ def fits(name: str) -> Outcome:
         )
 
     spread = np.abs(exact - exact.mean(0)).max()
-    found = fitted(points, exact).of_points(points)
-    return beside(found / spread, lambda: plainly() / spread, exact / spread, EXACT)
+    ours = fitted(points, exact).of_points(points)
+    return beside(ours / spread, lambda: plainly() / spread, exact / spread, EXACT)

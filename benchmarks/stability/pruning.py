@@ -1,6 +1,4 @@
-"""Colours and logits that break printed soft histograms (Eq 13) and masks (Eqs 11-12;
-docs/method.md, section 5).
-"""
+"""Values that break printed soft histograms and masks (Eqs 11-13; docs/method.md, section 5)."""
 
 from __future__ import annotations
 
@@ -29,8 +27,11 @@ def exact_histogram(values: Tensor, low: Tensor, high: Tensor) -> np.ndarray:
         v = np.frompyfunc(mpmath.mpf, 1, 1)(values.double().numpy())
         width = max((mpmath.mpf(high.item()) - mpmath.mpf(low.item())) / N_BINS, mpmath.mpf("1e-6"))
         inside = (v - mpmath.mpf(low.item())) / width
-        below = [[1 / (1 + mpmath.exp(min(20 * (x - edge), mpmath.mpf(10) ** 6))) for edge in range(1, N_BINS)]
-                 for x in inside]  # fmt: skip
+        most = mpmath.mpf(10) ** 6
+        below = [
+            [1 / (1 + mpmath.exp(min(20 * (x - edge), most))) for edge in range(1, N_BINS)]
+            for x in inside
+        ]
         mass = np.diff(
             np.array([[0, *row, 1] for row in below], object).reshape(-1, N_BINS + 1), axis=1
         )
@@ -57,28 +58,26 @@ def histogram(name: str) -> Outcome:
     values = VALUES[name]()
     low, high = values.aminmax() if "beyond" not in name else (torch.tensor(0.0), torch.tensor(1.0))
     inputs = [v.clone().requires_grad_(True) for v in (values, low, high)]
-    found = soft_histogram(
-        inputs[0], torch.ones(len(values), dtype=torch.bool), N_BINS, *inputs[1:]
-    )
-    slopes = torch.autograd.grad(found.square().sum(), inputs)
+    bins = soft_histogram(inputs[0], torch.ones(len(values), dtype=torch.bool), N_BINS, *inputs[1:])
+    slopes = torch.autograd.grad(bins.square().sum(), inputs)
     if not all(torch.isfinite(s).all() for s in slopes):
         raise ValueError("a gradient is not finite")
     error = max(
-        relative(found.detach(), exact_histogram(values, low, high)), abs(found.sum().item() - 1)
+        relative(bins.detach(), exact_histogram(values, low, high)), abs(bins.sum().item() - 1)
     )
     return Outcome(error, HISTOGRAM)
 
 
 @case("histogram of {n} values among {bad}", n=[0, 12], bad=[np.nan, np.inf, 1e38])
 def invalid(n: int, bad: float) -> Outcome:
-    """What is not valid leaves no trace, in value or gradient."""
+    """Values that are not valid leave no trace, in histogram or gradient."""
     values = torch.cat([normal(n).clamp(-1, 1), torch.full((20,), bad)]).requires_grad_(True)
     valid, low, high = torch.arange(n + 20) < n, torch.tensor(-1.0), torch.tensor(1.0)
-    found = soft_histogram(values, valid, N_BINS, low, high)
-    (slope,) = torch.autograd.grad(found.square().sum(), values)
+    bins = soft_histogram(values, valid, N_BINS, low, high)
+    (slope,) = torch.autograd.grad(bins.square().sum(), values)
     if not torch.isfinite(slope).all() or (slope[n:] != 0).any():
         raise ValueError("what is not valid has a gradient")
-    error = relative(found.detach(), exact_histogram(values.detach()[:n], low, high))
+    error = relative(bins.detach(), exact_histogram(values.detach()[:n], low, high))
     return Outcome(error, HISTOGRAM)
 
 
@@ -101,9 +100,7 @@ def masks(size: float) -> Outcome:
 
 @case("a mask of 0 renders as if removed")
 def masked_render() -> Outcome:
-    """Image of masked Gaussians against that of the rest; stored log-scales get a finite
-    gradient.
-    """
+    """Image of masked Gaussians against that of the rest; log-scales get a finite gradient."""
     g = torch.Generator().manual_seed(0)
     means = torch.rand(40, 3, generator=g) * torch.tensor([2.4, 1.6, 3.0]) - torch.tensor(
         [1.2, 0.8, -1.0]

@@ -67,21 +67,19 @@ def reach(means: np.ndarray, centers: Any) -> float:
 
 @case("{name}", name=POINTS)
 def points(name: str) -> Outcome:
-    """Raises ValueError if members are not unique, not within the radius, or not led by their
-    centre.
-    """
+    """Raises ValueError on members that repeat, lie beyond the radius, or have no centre first."""
     means = POINTS[name]()
-    found = regions_of(means, DescribeSection(n_regions=N_REGIONS, region_size=SIZE))
-    present = found.members >= 0
-    distance = np.linalg.norm(means[found.members] - means[found.centers][:, None], axis=-1)
+    regions = regions_of(means, DescribeSection(n_regions=N_REGIONS, region_size=SIZE))
+    present = regions.members >= 0
+    distance = np.linalg.norm(means[regions.members] - means[regions.centers][:, None], axis=-1)
     unique = all(
         len(np.unique(row[here])) == here.sum()
-        for row, here in zip(found.members, present, strict=True)
+        for row, here in zip(regions.members, present, strict=True)
     )
-    covered = reach(means, found.centers)
-    if not unique or (found.members[:, 0] != found.centers).any():
+    covered = reach(means, regions.centers)
+    if not unique or (regions.members[:, 0] != regions.centers).any():
         raise ValueError("members are not unique, or not led by their centre")
-    if (distance[present] > found.radius * (1 + 1e-6)).any() or covered > found.radius:
+    if (distance[present] > regions.radius * (1 + 1e-6)).any() or covered > regions.radius:
         raise ValueError("a member or a point lies beyond the radius")
     exact = reach(means, farthest(means, N_REGIONS))
     return Outcome(max(covered / exact - 1, 0.0) if exact else covered, TOLERANCE)

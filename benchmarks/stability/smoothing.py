@@ -1,6 +1,4 @@
-"""Gaussians that break plain bilateral smoothing, and scenes whose metre is hard to tell
-(docs/method.md, section 13).
-"""
+"""Gaussians that break plain smoothing; scenes of unclear metre (docs/method.md, section 13)."""
 
 from __future__ import annotations
 
@@ -28,9 +26,7 @@ UNIT = 0.25  # as rooms differ
 
 
 class Cloud(NamedTuple):
-    """N Gaussians: means, unit normals, colours and features [N, 3], evidence [N]; unit: scene
-    units of a metre.
-    """
+    """means, unit normals, colours, features [N, 3], evidence [N]; unit: scene units of a metre."""
 
     means: np.ndarray
     normals: np.ndarray
@@ -96,18 +92,18 @@ def smoothed(of: Cloud, dtype: type) -> np.ndarray:
     weights = np.where(square <= REACH**2, np.exp(-exponent / 2), 0)
     weights[np.arange(len(x)), np.arange(len(x))] = 1
     total = weights @ evidence
-    found = (weights @ (evidence[:, None] * features)) / total[:, None]
-    return np.where(total[:, None] > 0, found, features) if dtype is np.longdouble else found
+    mean = (weights @ (evidence[:, None] * features)) / total[:, None]
+    return np.where(total[:, None] > 0, mean, features) if dtype is np.longdouble else mean
 
 
 @case("smoothed, {name}", name=CLOUDS)
 def smooths(name: str) -> Outcome:
     """Against 80 bits over all pairs."""
     of = CLOUDS[name]()
-    found = smooth(of.features, of.evidence, affinities(of.means, of.normals, of.colors, of.unit))
+    ours = smooth(of.features, of.evidence, affinities(of.means, of.normals, of.colors, of.unit))
     with np.errstate(divide="ignore", invalid="ignore"):
         exact = smoothed(of, np.longdouble)
-    return beside(found, lambda: smoothed(of, np.float32), exact, TOLERANCE)
+    return beside(ours, lambda: smoothed(of, np.float32), exact, TOLERANCE)
 
 
 def room(n: int = 2000) -> np.ndarray:

@@ -1,10 +1,8 @@
-"""Gaussians that break rasterizers, in the modules of a default run: images, gradients, colours,
-planes, features.
+"""Gaussians that break rasterizers: images, gradients, colours, planes, features of a default run.
 
 Errors are those of float32 on the CPU against float64 in plain torch or numpy. Of images and
-features it is the mean
-difference over the mean, of gradients that of norms: where float32 rounds an alpha across 1/255,
-  one pixel differs.
+features it is the mean difference over the mean, of gradients that of norms: where float32 rounds
+an alpha across 1/255, one pixel differs.
 """
 
 from __future__ import annotations
@@ -65,7 +63,8 @@ SPOILED: dict[str, Callable[[dict[str, Tensor]], object]] = {
     **{f"near-flat {ratio:.0e}": flat(ratio) for ratio in (1e-2, 1e-4, 1e-8, 0.0)},
     **{f"needles {length:.0e} by {width:.0e}": needle(length, width)
        for length, width in ((1.0, 1e-3), (1.0, 1e-6), (1e2, 1e-3), (1e3, 1e-9), (1e-3, 1e-9))},
-    **{f"quaternions times {factor:.0e}": times("quats", factor) for factor in (1e-30, 1e-10, 1e10, 1e30)},
+    **{f"quaternions times {factor:.0e}": times("quats", factor)
+       for factor in (1e-30, 1e-10, 1e10, 1e30)},
     **{f"scales times {factor:.0e}": times("scales", factor) for factor in (1e-6, 1e-3, 1e2, 1e6)},
     **{f"colours times {factor:.0e}": times("colors", factor) for factor in (1e-4, 1e4)},
     **{f"at a depth of {z:g}": at(z) for z in (0.0101, 1e4)},
@@ -74,9 +73,7 @@ SPOILED: dict[str, Callable[[dict[str, Tensor]], object]] = {
 
 
 def rendered(name: str, dtype: torch.dtype, mode: str) -> tuple[Tensor, list[Tensor]]:
-    """Image and coverage [1, H, W, 4], and the gradients of a loss to everything that the Gaussians
-    are.
-    """
+    """Image and coverage [1, H, W, 4], and a loss' gradients to all parameters of the Gaussians."""
     spoiled = gaussians()
     SPOILED[name](spoiled)
     leaves = [value.to(dtype, copy=True).requires_grad_(True) for value in spoiled.values()]
@@ -88,11 +85,11 @@ def rendered(name: str, dtype: torch.dtype, mode: str) -> tuple[Tensor, list[Ten
     return both.detach(), list(torch.autograd.grad((both[0] * weights).mean(), leaves))
 
 
-def apart(found: Tensor, exact: Tensor) -> float:
+def apart(ours: Tensor, exact: Tensor) -> float:
     """Mean difference over the mean; inf where one is not finite."""
-    if not (found.isfinite().all() and exact.isfinite().all()):
+    if not (ours.isfinite().all() and exact.isfinite().all()):
         return math.inf
-    return float((found.double() - exact).abs().mean() / exact.abs().mean().clamp_min(1e-12))
+    return float((ours.double() - exact).abs().mean() / exact.abs().mean().clamp_min(1e-12))
 
 
 @case("image, {mode}, {name}", mode=["classic", "antialiased"], name=SPOILED)
@@ -109,10 +106,10 @@ def gradient(mode: str, name: str) -> Outcome:
         rendered(name, torch.float32, mode)[1], rendered(name, torch.float64, mode)[1], strict=True
     )
     errors = []
-    for found, exact in pairs:
-        if not found.isfinite().all():
+    for ours, exact in pairs:
+        if not ours.isfinite().all():
             raise ValueError("a gradient is not finite")
-        errors.append(float((found.double() - exact).norm() / exact.norm().clamp_min(1e-12)))
+        errors.append(float((ours.double() - exact).norm() / exact.norm().clamp_min(1e-12)))
     return Outcome(max(errors), SLOPE)
 
 
@@ -125,18 +122,18 @@ def planes(name: str) -> Outcome:
         leaves = [
             spoiled[key].to(dtype, copy=True).requires_grad_(True) for key in ("means", "quats")
         ]
-        found = planes_in_view(
+        inverse = planes_in_view(
             *leaves, spoiled["scales"].to(dtype), torch.eye(4, dtype=dtype), K.to(dtype), 0.01
         )
-        slopes = torch.autograd.grad(found.sum(), leaves)
+        slopes = torch.autograd.grad(inverse.sum(), leaves)
         lengths = spoiled["quats"].to(dtype).abs().amax(1, keepdim=True)
-        both.append([found.detach(), slopes[0], slopes[1] * lengths])
+        both.append([inverse.detach(), slopes[0], slopes[1] * lengths])
     return Outcome(max(relative(*pair) for pair in zip(*both, strict=True)), 1e-3)
 
 
 @case("features, {name}", name=SPOILED)
 def features(name: str) -> Outcome:
-    """What features of cells say of Gaussians, lifted, against every Gaussian at every pixel."""
+    """Features of cells lifted to Gaussians, against every Gaussian at every pixel."""
     spoiled = gaussians()
     SPOILED[name](spoiled)
     parts = tuple(spoiled[key].numpy() for key in ("means", "quats", "scales", "opacities"))
@@ -148,9 +145,9 @@ def features(name: str) -> Outcome:
         values,
         np.ones(values.shape[:2], np.float32),
     )
-    found, (weights, sums) = lift.lift(parts, *rest), reference.lift(parts, *rest)
+    lifted, (weights, sums) = lift.lift(parts, *rest), reference.lift(parts, *rest)
     dense = np.zeros((N, 6))
-    dense[found.ids] = np.column_stack([found.weights, found.sums])
+    dense[lifted.ids] = np.column_stack([lifted.weights, lifted.sums])
     exact = torch.from_numpy(np.column_stack([weights, sums]))
     return Outcome(apart(torch.from_numpy(dense), exact), IMAGE)
 
@@ -188,9 +185,7 @@ def finished(name: str) -> Outcome:
 
 @case("1e6 on a pixel, opacity {opacity}", opacity=[0.002, 0.0041, 0.05, 0.5, 0.7])
 def on_a_pixel(opacity: float) -> Outcome:
-    """Equal Gaussians, one behind another, against the sum of the series that ends at a
-    transmittance of 1e-4.
-    """
+    """Equal Gaussians, one behind another, against the series until a transmittance of 1e-4."""
     n, size = 1_000_000, 8
     camera = (
         torch.eye(4)[None],
@@ -202,16 +197,16 @@ def on_a_pixel(opacity: float) -> Outcome:
     shape = torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), torch.full((n, 3), 1e-4)
     opacities = torch.full((n,), opacity).requires_grad_(True)
     colors = torch.tensor([[0.25, 0.5, 1.0]]).repeat(n, 1).requires_grad_(True)
-    found, alpha, _ = rasterize(means, *shape, opacities, colors, *camera)
-    left, shown = 1.0, 0
+    render, alpha, _ = rasterize(means, *shape, opacities, colors, *camera)
+    left, n_visible = 1.0, 0
     while opacity >= 1 / 255 and left * (1 - opacity) > 1e-4:
-        left, shown = left * (1 - opacity), shown + 1
+        left, n_visible = left * (1 - opacity), n_visible + 1
     to_opacities, to_colors = torch.autograd.grad(
-        found[0, 4, 4].sum() + alpha[0, 4, 4].sum(), [opacities, colors]
+        render[0, 4, 4].sum() + alpha[0, 4, 4].sum(), [opacities, colors]
     )
-    if not (to_opacities.isfinite().all() and int((to_colors[:, 0] != 0).sum()) == shown):
+    if not (to_opacities.isfinite().all() and int((to_colors[:, 0] != 0).sum()) == n_visible):
         raise ValueError("a gradient is not finite, or reaches Gaussians that nobody sees")
-    values = [*found[0, 4, 4].tolist(), alpha[0, 4, 4, 0].item(), to_colors[:, 0].sum().item()]
+    values = [*render[0, 4, 4].tolist(), alpha[0, 4, 4, 0].item(), to_colors[:, 0].sum().item()]
     return Outcome(relative(values, (1 - left) * np.array([0.25, 0.5, 1.0, 1.0, 1.0])), 1e-4)
 
 
@@ -223,11 +218,11 @@ def sh(size: float, degree: int) -> Outcome:
     means, both = torch.randn(N, 3, generator=g), []
     for dtype in (torch.float32, torch.float64):
         leaves = [band.to(dtype, copy=True).requires_grad_(True) for band in bands[: degree + 1]]
-        found = colors_in_view(
+        colors = colors_in_view(
             leaves, None, index, means.to(dtype), torch.zeros(3, dtype=dtype), degree
         )
-        slopes = torch.autograd.grad(found.sum(), leaves)
-        both.append([found.detach(), *slopes])
+        slopes = torch.autograd.grad(colors.sum(), leaves)
+        both.append([colors.detach(), *slopes])
     values = basis(torch.nn.functional.normalize(means[index].double(), dim=-1), degree)
     coefficients = torch.cat([band[index].double() for band in bands[: degree + 1]], 1)
     exact = (torch.einsum("nk,nkc->nc", values, coefficients) + 0.5).clamp_min(0)
@@ -267,9 +262,7 @@ POINTS: dict[str, Callable[[Tensor], Tensor]] = {
 
 @case("Gaussians at points of {name}", name=POINTS)
 def points(name: str) -> Outcome:
-    """Share of initial values that are not finite; raises ValueError where a covariance is not
-    positive.
-    """
+    """Share of initial values that are not finite; ValueError if a covariance is not positive."""
     means = (
         POINTS[name](torch.randn(200, 3, generator=torch.Generator().manual_seed(0)))
         .double()
@@ -285,9 +278,7 @@ def points(name: str) -> Outcome:
 
 @case("halves, {name}", name=SPOILED)
 def halves(name: str) -> Outcome:
-    """Share of opacities and scales of split Gaussians that are not finite, or larger than
-    before.
-    """
+    """Share of opacities and scales of split Gaussians that are not finite, or that grew."""
     spoiled = gaussians()
     SPOILED[name](spoiled)
     logits, log_scales = spoiled["opacities"].logit(), spoiled["scales"].log().clamp_min(-60)

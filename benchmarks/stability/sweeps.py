@@ -1,5 +1,4 @@
-"""Photos that break plain matching of patches over depths, and what views agree on (docs/method.md,
-section 1).
+"""Photos that break plain matching over depths; confirmed depth (docs/method.md, section 1).
 
 Errors of depth are the median's, relative, over the pixels that count; of what must not change the
 largest.
@@ -71,11 +70,11 @@ def lit(*stops: float) -> Photos:
 
 def sweep(of: Photos) -> tuple[np.ndarray, np.ndarray]:
     tried = 1 / torch.linspace(1 / (0.5 * of.depth), 1 / (2 * of.depth), DEPTHS)
-    given = (
+    tensors = (
         torch.from_numpy(part).float()
         for part in (of.grey, of.valid, np.tile(K, (VIEWS, 1, 1)), of.poses)
     )
-    depth, cost = swept_depth(*given, 0, [1, 2, 3], tried)
+    depth, cost = swept_depth(*tensors, 0, [1, 2, 3], tried)
     return depth.numpy(), cost.numpy()
 
 
@@ -105,8 +104,8 @@ def plainly(of: Photos) -> np.ndarray:
     return tried[torch.stack(costs).argmin(0)].numpy()
 
 
-def off(found: np.ndarray, exact: float) -> float:
-    inner = np.abs(found[INNER] / exact - 1)
+def off(ours: np.ndarray, exact: float) -> float:
+    inner = np.abs(ours[INNER] / exact - 1)
     return float(np.median(inner)) if np.isfinite(inner).all() else float("inf")
 
 
@@ -202,10 +201,8 @@ def _with(views: int | slice, value: float) -> tuple[np.ndarray, np.ndarray, np.
 
 @case("agreement on a wall {name}", name=AGREE)
 def agreement(name: str) -> Outcome:
-    """The first view's depth: kept where others confirm it, 0 where they do not. The plain way
-    takes the mean of all.
-    """
-    depth, poses, others, kept = AGREE[name]()
-    exact = (depth[0] * kept)[INNER]
-    found = agreed(depth, np.tile(K, (VIEWS, 1, 1)), poses, others, 2)
-    return beside(found[0][INNER], lambda: depth.mean(0)[INNER], exact, 1e-5, relative)
+    """The first view's depth if others confirm it, else 0; the plain way takes the mean of all."""
+    depth, poses, others, confirmed = AGREE[name]()
+    exact = (depth[0] * confirmed)[INNER]
+    ours = agreed(depth, np.tile(K, (VIEWS, 1, 1)), poses, others, 2)
+    return beside(ours[0][INNER], lambda: depth.mean(0)[INNER], exact, 1e-5, relative)

@@ -1,5 +1,4 @@
-"""Trainings that ought to break: each ends with finite Gaussians, or stops and names its step and
-cause.
+"""Trainings that ought to break: each ends with finite Gaussians, or stops with step and cause.
 
 The error is the share of values that are not finite in what would be published, 1 where the
 training stopped without naming its step.
@@ -28,9 +27,7 @@ HEIGHT, WIDTH, CHANNELS = 40, 48, 8
 
 
 def four_views() -> Views:
-    """Photos of noise, 48 x 40, in an arc about the origin, with unit features of noise at a
-    quarter of the size.
-    """
+    """Noisy photos, 48 x 40, in an arc about the origin; unit features at a quarter of that."""
     g = torch.Generator().manual_seed(1)
     K = torch.tensor([[40.0, 0, WIDTH / 2], [0, 40.0, HEIGHT / 2], [0, 0, 1]])
     angles, poses = torch.linspace(0, 1.2, 4), torch.eye(4).repeat(4, 1, 1)
@@ -57,9 +54,7 @@ def sphere(n: int) -> np.ndarray:
 def tiny_trainer(
     means: np.ndarray | None = None, views: Views | None = None, **settings: Any
 ) -> Trainer:
-    """A trainer of few Gaussians, by default 300 on a unit sphere; settings: what differs in the
-    train section.
-    """
+    """A trainer of few Gaussians, by default 300 on a unit sphere; settings: of training."""
     means = sphere(300) if means is None else means
     colors = (
         (torch.rand(len(means), 3, generator=torch.Generator().manual_seed(2)) * 255).byte().numpy()
@@ -107,6 +102,10 @@ def _corrupt(value: float) -> Callable[[Views], Any]:
     return change
 
 
+def _multiplied(factor: float) -> Callable[[Views], Any]:
+    return lambda views: lambda k: factor * views.features(k)  # type: ignore[misc]
+
+
 def _black(views: Views) -> torch.Tensor:
     images = views.images.clone()
     images[1] = 0
@@ -120,7 +119,8 @@ def _away(views: Views) -> torch.Tensor:
 
 
 def _hidden(views: Views) -> torch.Tensor:
-    return torch.arange(4)[:, None, None].ne(1).expand(views.images.shape[:3])  # type: ignore[arg-type]
+    shape = views.images.shape[:3]
+    return torch.arange(4)[:, None, None].ne(1).expand(shape)  # type: ignore[arg-type]
 
 
 def _lost(views: Views) -> torch.Tensor:
@@ -181,10 +181,8 @@ SCENES: dict[str, Callable[[], Trainer]] = {
     ),
     "a NaN colour": lambda: _raw(sh0=lambda v: v[3].fill_(torch.nan)),
     "NaN features of one Gaussian": lambda: _raw(features=lambda v: v[3].fill_(torch.nan)),
-    "teacher features of norm 1e6": lambda: _with_views(
-        features=lambda v: lambda k: 1e6 * v.features(k)
-    ),  # type: ignore[misc]
-    "teacher features of 0": lambda: _with_views(features=lambda v: lambda k: 0 * v.features(k)),  # type: ignore[misc]
+    "teacher features of norm 1e6": lambda: _with_views(features=_multiplied(1e6)),
+    "teacher features of 0": lambda: _with_views(features=_multiplied(0.0)),
     "one view's features NaN": lambda: _with_views(features=_corrupt(float("nan"))),
     "one view's features 1e30": lambda: _with_views(features=_corrupt(1e30)),
     "one view black": lambda: _with_views(images=_black),

@@ -1,1 +1,1 @@
-"""What teaching knowledge takes, and how far views agree."""
+"""Costs of teaching knowledge, and agreement of views."""

@@ -1,5 +1,4 @@
-"""What lessons of scenes are worth in other scenes: mIoU of shape alone, and blended with the
-teacher's averages.
+"""Worth of lessons of scenes in other scenes: mIoU of shape alone, and blended with the teacher's.
 
 Of finished scenes (--scenes), each is asked in turn with lessons of the others: of 1, 2, 4, ... of
 them, alone and beside what ships; of few of their points; of points that a user labelled in one of
@@ -30,7 +29,7 @@ from chebsplat.shape.lessons import (
 from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.stages.shape_models.answers import units
 from chebsplat.stages.shape_models.teaching_rooms import Room
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.teacher_models.text_encoder import match_names
 from chebsplat.synthetic import CLASS_NAMES
 
 
@@ -42,43 +41,45 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     knowledge = read_knowledge(SHIPPED)
     encoder = PointEncoder.restored(knowledge.encoder, knowledge.weights)
-    classes = knowledge.embeddings[found(list(CLASS_NAMES), knowledge.words)].astype(np.float32)
+    classes = knowledge.embeddings[match_names(list(CLASS_NAMES), knowledge.words)].astype(
+        np.float32
+    )
     rooms = [scene_room(name) for name in options.scenes]
     features = [encoder.encode(room.inputs) for room in rooms]
-    asked = Asked(knowledge, rooms, features, classes)
+    scenes = Scenes(knowledge, rooms, features, classes)
     print(f"{len(rooms)} scenes; {shared.machine()}")
-    rows = [{"variant": "the teacher's averages", "shape": "", "both": asked.teacher()}]
-    rows.append({"variant": "what ships"} | asked.figures([[] for _ in rooms], SHIPPED_WORTH))
-    everyone = [asked.taught(k) for k in range(len(rooms))]
+    rows = [{"variant": "the teacher's averages", "shape": "", "both": scenes.teacher()}]
+    rows.append({"variant": "what ships"} | scenes.figures([[] for _ in rooms], SHIPPED_WORTH))
+    everyone = [scenes.learn(k) for k in range(len(rooms))]
     for count in (1, 2, 4, 8, 16):
         if count < len(rooms):
-            chosen = [
+            lessons = [
                 [everyone[(k + 1 + step) % len(rooms)] for step in range(count)]
                 for k in range(len(rooms))
             ]
-            rows.append({"variant": f"{count} lessons alone"} | asked.figures(chosen, 0.0))
+            rows.append({"variant": f"{count} lessons alone"} | scenes.figures(lessons, 0.0))
             name = f"{count} lessons and what ships"
-            rows.append({"variant": name} | asked.figures(chosen, SHIPPED_WORTH))
+            rows.append({"variant": name} | scenes.figures(lessons, SHIPPED_WORTH))
     for points in (300, 1000, 3000):
-        fewer = [asked.taught(k, points) for k in range(len(rooms))]
-        chosen = [[of for other, of in enumerate(fewer) if other != k] for k in range(len(rooms))]
-        rows.append({"variant": f"lessons of {points} points alone"} | asked.figures(chosen, 0.0))
+        fewer = [scenes.learn(k, points) for k in range(len(rooms))]
+        lessons = [[of for other, of in enumerate(fewer) if other != k] for k in range(len(rooms))]
+        rows.append({"variant": f"lessons of {points} points alone"} | scenes.figures(lessons, 0.0))
     for points in (100, 300, 1000):
-        marked = [asked.labelled(k, points) for k in range(len(rooms))]
-        chosen = [[marked[(k + 1) % len(rooms)]] for k in range(len(rooms))]
+        marked = [scenes.labelled(k, points) for k in range(len(rooms))]
+        lessons = [[marked[(k + 1) % len(rooms)]] for k in range(len(rooms))]
         rows.append(
             {"variant": f"{points} labelled points of one scene, alone"}
-            | asked.figures(chosen, 0.0)
+            | scenes.figures(lessons, 0.0)
         )
         name = f"{points} labelled points, and what ships"
-        rows.append({"variant": name} | asked.figures(chosen, SHIPPED_WORTH))
+        rows.append({"variant": name} | scenes.figures(lessons, SHIPPED_WORTH))
     for row in rows:
         print(f"{row['variant']:42s} shape {row['shape']:>5}   both {row['both']:>5}")
     shared.write_csv(options.out / "lessons.csv", rows)
 
 
-class Asked:
-    """Scenes with their features of shape, and what maps of lessons say of them."""
+class Scenes:
+    """Scenes with their features of shape, and figures of maps of lessons in them."""
 
     def __init__(
         self,
@@ -92,9 +93,10 @@ class Asked:
 
     def teacher(self) -> str:
         """mIoU of the teacher's averages."""
-        return f"{np.mean(scores([room.features for room in self.rooms], self.rooms, self.classes)):.1f}"
+        features = [room.features for room in self.rooms]
+        return f"{np.mean(scores(features, self.rooms, self.classes)):.1f}"
 
-    def taught(self, scene: int, points: int | None = None) -> Sums:
+    def learn(self, scene: int, points: int | None = None) -> Sums:
         """The lesson of a scene, or of some of its points."""
         room = self.rooms[scene]
         labels = decode_labels(room.features, self.classes)

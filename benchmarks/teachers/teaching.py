@@ -1,14 +1,11 @@
-"""What an encoder of points owes to its transformers and its descriptors: error on rooms held out,
-against seconds.
+"""Worth of transformers and descriptors in an encoder of points: error in new rooms by seconds.
 
 Rooms are made once and kept (--rooms-in). Variants are taught alike, with each seed, have as many
 features, and answer by the map that the rooms' lessons give in closed form. A figure is the mIoU of
-a room's points that some view sees,
-averaged over the rooms held out and the seeds: of shape alone, where depth shows the room, where
-  few photos do, and
-where a sweep of its photos does; and of both, blended with the teacher's averages as in a scene
-whose training views ask for k = 2. In brackets the difference to pooling, with its 95 % interval
-over rooms.
+a room's points that some view sees, averaged over the rooms held out and the seeds: of shape alone,
+where depth shows the room, where few photos do, and where a sweep of its photos does; and of both,
+blended with the teacher's averages as in a scene whose training views ask for k = 2. In brackets
+the difference to pooling, with its 95 % interval over rooms.
 """
 
 from __future__ import annotations
@@ -42,9 +39,9 @@ from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.shape.point_inputs import PointInputs
 from chebsplat.stages.settings import TeachSection
 from chebsplat.stages.shape_models.surfaces import in_scene
-from chebsplat.stages.shape_models.teaching_rooms import Room, held, prepare
+from chebsplat.stages.shape_models.teaching_rooms import Room, load_room, prepare
 from chebsplat.stages.teach import drawn_lesson, example_of
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.teacher_models.text_encoder import match_names
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.layout import KNOWLEDGE
 
@@ -71,7 +68,7 @@ def scores(
     return figures
 
 
-def made(
+def prepare_rooms(
     folder: Path, seeds: Sequence[int], settings: TeachSection, matrix: np.ndarray
 ) -> list[list[Room]]:
     """The rooms of these seeds, as `rooms_of` gives them; kept in the folder."""
@@ -82,7 +79,7 @@ def made(
                 prepare, *zip(*((folder, seed, settings, matrix) for seed in seeds), strict=True)
             )
         )
-    return [held(folder, seed) for seed in seeds]
+    return [load_room(folder, seed) for seed in seeds]
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -101,14 +98,17 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--only", help="variants whose names hold this")
     options = parser.parse_args(arguments)
     knowledge, settings = read_knowledge(SHIPPED), TeachSection()
-    embeddings = knowledge.embeddings[found(list(CLASS_NAMES), knowledge.words)].astype(np.float32)
+    embeddings = knowledge.embeddings[match_names(list(CLASS_NAMES), knowledge.words)].astype(
+        np.float32
+    )
     seeds = [*KNOWLEDGE[: options.rooms], *KNOWLEDGE[-options.held_out :]]
-    rooms = made(options.rooms_in, seeds, settings, knowledge.matrix)
+    rooms = prepare_rooms(options.rooms_in, seeds, settings, knowledge.matrix)
     tested = {name: [room[kind] for room in rooms[options.rooms :]] for name, kind in KINDS.items()}
     tested |= {name: [scene_room(name)] for name in options.scenes}
-    print(f"{options.steps} steps, seeds {options.seeds}, {options.rooms} rooms, "
-          f"{options.held_out} held out, "
-          f"{torch.get_num_threads()} threads, {shared.processor()}")  # fmt: skip
+    print(
+        f"{options.steps} steps, seeds {options.seeds}, {options.rooms} rooms, "
+        f"{options.held_out} held out, {torch.get_num_threads()} threads, {shared.processor()}"
+    )
     rows: list[dict[str, Any]] = []
 
     def add(variant: str, measure: str, seed: int, seconds: float, values: Sequence[float]) -> None:
@@ -124,7 +124,7 @@ def main(arguments: Sequence[str]) -> None:
         if options.only and options.only not in name and name != BASELINE:
             continue
         for seed in options.seeds:
-            encoder, found_map, seconds = taught(
+            encoder, found_map, seconds = train_encoder(
                 rooms[: options.rooms], variant, options.steps, embeddings, seed
             )
             for measure, of in tested.items():
@@ -145,9 +145,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def scene_room(name: str) -> Room:
-    """A finished scene's described points as a room: what its teacher says of each, and its true
-    label.
-    """
+    """A finished scene's described points as a room: its teacher's features, the true labels."""
     capture, points, features, described = (
         kind.read(artifact_of(name, stage))
         for kind, stage in (
@@ -166,10 +164,10 @@ def scene_room(name: str) -> Room:
     used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]]]
     depth = [capture.depth[row[points.names[k]]] for k in used]
     means, cameras = in_scene(described)[0], (points.Ks[used], points.cam_from_world[used])
-    said = [features.features[place[points.names[k]]].astype(np.float32) for k in used]
-    mean, n_views = averaged(means, depth, said, features.features.shape[-1], *cameras)
-    known = found(capture.class_names, list(CLASS_NAMES))
-    one_hot = np.eye(len(CLASS_NAMES) + 1, dtype=np.float32)[[*known, -1]]  # -1: none, the last
+    grids = [features.features[place[points.names[k]]].astype(np.float32) for k in used]
+    mean, n_views = averaged(means, depth, grids, features.features.shape[-1], *cameras)
+    classes = match_names(capture.class_names, list(CLASS_NAMES))
+    one_hot = np.eye(len(CLASS_NAMES) + 1, dtype=np.float32)[[*classes, -1]]  # -1: none, the last
     truth = (one_hot[capture.labels[row[points.names[k]]]] for k in used)
     votes, _ = averaged(means, depth, truth, one_hot.shape[1], *cameras)
     labels = np.where(votes.argmax(1) < len(CLASS_NAMES), votes.argmax(1), -1)
@@ -202,24 +200,24 @@ def lines(rows: Sequence[dict[str, Any]], name: str) -> list[str]:
     return found_lines
 
 
-def taught(
+def train_encoder(
     rooms: list[list[Room]], variant: dict[str, Any], steps: int, embeddings: np.ndarray, seed: int
 ) -> tuple[PointEncoder, np.ndarray, float]:
-    """An encoder that was taught so in these rooms, the map of their lessons, and the seconds of
-    teaching.
-    """
-    chosen = [room[kind] for kind in variant.get("kinds", (0, 1, 2, 3)) for room in rooms]
-    examples = [example_of(room, embeddings) for room in chosen]
+    """An encoder trained so in these rooms, their lessons' map, and the seconds of training."""
+    training_rooms = [room[kind] for kind in variant.get("kinds", (0, 1, 2, 3)) for room in rooms]
+    examples = [example_of(room, embeddings) for room in training_rooms]
     torch.manual_seed(seed)
     width = examples[0].cloud.descriptors.shape[1] if variant.get("described", True) else 0
     encoder = PointEncoder(embeddings.shape[1], width, attends=variant.get("attends", True))
     encoder.set_inputs([example.cloud for example in examples])
     began = time.perf_counter()
-    for _ in point_encoder.taught(encoder, examples, point_encoder.Course(steps=steps, seed=seed)):
+    for _ in point_encoder.train_encoder(
+        encoder, examples, point_encoder.Course(steps=steps, seed=seed)
+    ):
         pass
     encoder.eval()
     seconds = time.perf_counter() - began
-    sums = (drawn_lesson(encoder, room, embeddings) for room in chosen)
+    sums = (drawn_lesson(encoder, room, embeddings) for room in training_rooms)
     total = next(sums)
     for one in sums:
         total = combined([total, one], [1.0, 1.0])

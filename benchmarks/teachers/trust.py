@@ -1,12 +1,10 @@
-"""Does the agreement of views rank 2D teachers as their true mIoU does? Scenes x teachers, without
-a training.
+"""Rank correlation of views' agreement and true mIoU of 2D teachers: scenes x teachers.
 
 Every pair runs up to the stage `agree`, whose figure knows no true labels. Beside it stands the
 mIoU of the teacher's own label maps against the true labels of all views, over the classes that
 occur in either. Teachers: the embedded one, which has seen generated rooms and not the houses, and
-  the source's labels with a share of the segments confused.
-The houses need the test data (CHEBSPLAT_TEST_DATA), and are left out with a line where it is not
-there.
+the source's labels with a share of the segments confused. The houses need the test data
+(CHEBSPLAT_TEST_DATA), and are left out with a line where it is not there.
 """
 
 from __future__ import annotations
@@ -34,19 +32,17 @@ TEACHERS = {"embedded": ""} | {
 BAR, LEAST = 0.8, 12  # rank correlation, and pairs that it needs
 
 
-def true_miou(made: Mapping[str, Path]) -> float:
-    """mIoU of the labels that a scene's teacher gives all views, at their resolution; artifacts by
-    stage.
-    """
-    capture, features = Capture.read(made["ingest"]), Features.read(made["teacher"])
+def true_miou(artifacts: Mapping[str, Path]) -> float:
+    """mIoU of a teacher's labels of all views, at their resolution; artifacts by stage."""
+    capture, features = Capture.read(artifacts["ingest"]), Features.read(artifacts["teacher"])
     assert capture.labels is not None and capture.class_names and features.pseudo_labels is not None
     row, n = {name: k for k, name in enumerate(features.names)}, len(capture.class_names)
     counts = np.zeros((n + 1, n + 1), np.int64)
     for view, name in enumerate(capture.names):
         truth = capture.labels[view]
-        said = resized(features.pseudo_labels[row[name]], truth.shape)
+        prediction = resized(features.pseudo_labels[row[name]], truth.shape)
         counts += confusion(
-            predicted(said, features.label_names, capture.class_names, n), truth, n + 1
+            predicted(prediction, features.label_names, capture.class_names, n), truth, n + 1
         )
     return float(np.nanmean(segmentation(counts).iou[:-1]))
 
@@ -59,15 +55,15 @@ def main(arguments: Sequence[str]) -> int:
     plans = shared.finished([(scene, TEACHERS[teacher]) for scene, teacher in pairs], "agree")
     rows = []
     for (scene, teacher), plan in zip(pairs, plans, strict=True):
-        found, miou = ViewAgreement.read(plan.targets["agree"]), true_miou(plan.targets)
-        value = found.agreement or 0.0
+        measured, miou = ViewAgreement.read(plan.targets["agree"]), true_miou(plan.targets)
+        value = measured.agreement or 0.0
         rows.append(
             {
                 "scene": scene,
                 "teacher": teacher,
                 "agreement": value,
                 "miou": miou,
-                "points": found.n_points,
+                "points": measured.n_points,
             }
         )
         print(f"{scene:<10} {teacher:<22} agreement {value:.3f}  true mIoU {miou:.1%}")
@@ -75,10 +71,11 @@ def main(arguments: Sequence[str]) -> int:
     agreements, mious = (np.array([row[key] for row in rows]) for key in ("agreement", "miou"))
     rank = float(spearmanr(agreements, mious)[0]) if len(rows) > 2 else 0.0
     low = AgreeSection().low
-    print(f"{len(rows)} pairs (at least {LEAST}), rank correlation {rank:.3f} (bar {BAR})")
     for side, which in (("below", agreements < low), ("above", agreements >= low)):
         if which.any():
-            print(f"{side} {low:g}, where a scene {'warns' if side == 'below' else 'does not'}: "
-                  f"{which.sum()} pairs, "
-                  f"mIoU {mious[which].min():.1%} to {mious[which].max():.1%}")  # fmt: skip
-    return int(len(rows) < LEAST or rank < BAR)
+            print(
+                f"{side} {low:g}, where a scene {'warns' if side == 'below' else 'does not'}: "
+                f"{which.sum()} pairs, mIoU {mious[which].min():.1%} to {mious[which].max():.1%}"
+            )
+    bars = [("pairs", len(rows), ">=", LEAST), ("rank correlation", rank, ">=", BAR)]
+    return int(not all(shared.judged(bars)))

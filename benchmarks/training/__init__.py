@@ -1,1 +1,1 @@
-"""What a training costs, on a CPU and on a GPU."""
+"""Costs of a training, on a CPU and on a GPU."""

@@ -1,13 +1,12 @@
-"""What a training costs beside plain 3DGS; with --growth, how it grows with Gaussians, pixels and
-views.
+"""Cost of a training beside plain 3DGS; with --growth, by Gaussians, pixels and views.
 
 The trainings take turns of fifty steps, so that other load on the machine meets all alike; a short
 training of each goes before, so that no kernel is left to compile.
 
 Of growth, each case is a process of its own: some steps of the default training, colour and depth
-  loss, on views of the
-scene that are enlarged and repeated, from as many points of its depth as Gaussians are wanted.
-Exponents are slopes of logarithms between the first and the last case of a row.
+loss, on views of the scene that are enlarged and repeated, from as many points of its depth as
+Gaussians are wanted. Exponents are slopes of logarithms between the first and the last case of a
+row.
 """
 
 from __future__ import annotations
@@ -68,8 +67,7 @@ def trainer_from(work: Path, config: Config, backend: str = "auto", device: str 
     teacher.
 
     Args: work: folder of the links `ingest`, `sfm` and, if semantics are trained, `teacher`;
-      backend: of the
-          rasterizer; device: `cpu` or `cuda`.
+      backend: of the rasterizer; device: `cpu` or `cuda`.
     """
     inputs = {"capture": work / "ingest", "points": work / "sfm"}
     job = job_of(
@@ -84,20 +82,18 @@ def begun(work: Path, ablation: str, steps: int) -> Trainer:
 
 
 def by_turns(work: Path, variants: Sequence[str], n_steps: int) -> dict[str, float]:
-    """Milliseconds a step of whole trainings, as a multiple of the first variant's, which is
-    returned.
-    """
+    """Milliseconds a step of whole trainings; returns multiples of the first variant's."""
     for name in variants:
         for _ in begun(work, name, REHEARSAL).steps():
             pass
     trainers = {name: begun(work, name, n_steps) for name in variants}
     rounds = {name: trainer.steps() for name, trainer in trainers.items()}
-    for done in range(0, n_steps, TURN):
+    for n_done in range(0, n_steps, TURN):
         for steps in rounds.values():
-            for _ in range(min(TURN, n_steps - done)):
+            for _ in range(min(TURN, n_steps - n_done)):
                 next(steps)
-        if (done + TURN) % 500 == 0 or done + TURN >= n_steps:
-            print(f"after {min(done + TURN, n_steps)} steps")
+        if (n_done + TURN) % 500 == 0 or n_done + TURN >= n_steps:
+            print(f"after {min(n_done + TURN, n_steps)} steps")
             for name, trainer in trainers.items():
                 ratio = trainer.seconds / trainers[variants[0]].seconds
                 parts = "  ".join(
@@ -115,17 +111,17 @@ def by_turns(work: Path, variants: Sequence[str], n_steps: int) -> dict[str, flo
 
 def enlarged(work: Path, size: tuple[int, int], n_views: int, out: Path) -> Path:
     """A capture of a scene's training views, repeated and enlarged to pixels (width, height)."""
-    given = Capture.read(work / "ingest")
-    assert given.cam_from_world is not None and given.depth is not None
-    used = np.resize(np.flatnonzero(~given.is_test), n_views)
-    rows = np.arange(size[1]) * given.size[1] // size[1]
-    columns = np.arange(size[0]) * given.size[0] // size[0]
+    source = Capture.read(work / "ingest")
+    assert source.cam_from_world is not None and source.depth is not None
+    used = np.resize(np.flatnonzero(~source.is_test), n_views)
+    rows = np.arange(size[1]) * source.size[1] // size[1]
+    columns = np.arange(size[0]) * source.size[0] // size[0]
     images = np.empty((n_views, size[1], size[0], 3), np.uint8)
     depth = np.empty((n_views, size[1], size[0]), np.float32)
     for k, view in enumerate(used):
-        images[k] = given.images[view][rows[:, None], columns]
-        depth[k] = given.depth[view][rows[:, None], columns]
-    Ks = given.Ks[used] * np.array([[size[0] / given.size[0]], [size[1] / given.size[1]], [1.0]])
+        images[k] = source.images[view][rows[:, None], columns]
+        depth[k] = source.depth[view][rows[:, None], columns]
+    Ks = source.Ks[used] * np.array([[size[0] / source.size[0]], [size[1] / source.size[1]], [1.0]])
     nothing: dict[str, Any] = {
         "labels": None,
         "loss_mask": None,
@@ -133,8 +129,8 @@ def enlarged(work: Path, size: tuple[int, int], n_views: int, out: Path) -> Path
         "confidence": None,
     }
     capture = replace(
-        given, names=[f"view{k:04d}" for k in range(n_views)], images=images, depth=depth, Ks=Ks,
-        cam_from_world=given.cam_from_world[used], is_test=np.zeros(n_views, bool), **nothing,
+        source, names=[f"view{k:04d}" for k in range(n_views)], images=images, depth=depth, Ks=Ks,
+        cam_from_world=source.cam_from_world[used], is_test=np.zeros(n_views, bool), **nothing,
     )  # fmt: skip
     folder = out / "capture"
     with artifact.publish(
@@ -145,25 +141,32 @@ def enlarged(work: Path, size: tuple[int, int], n_views: int, out: Path) -> Path
 
 
 def measured(capture: Path, n_gaussians: int, device: str = "cpu") -> dict[str, float]:
-    """What a training of this process takes; nothing else is to be in its memory, which on a GPU is
-    its tensors'.
-    """
-    held, rng = Capture.read(capture), np.random.default_rng(0)
-    assert held.cam_from_world is not None and held.depth is not None
-    views = np.linspace(0, len(held.names) - 1, 60).astype(int)
+    """Cost of a training, alone in this process, whose memory on a GPU is that of its tensors."""
+    photos, rng = Capture.read(capture), np.random.default_rng(0)
+    assert photos.cam_from_world is not None and photos.depth is not None
+    views = np.linspace(0, len(photos.names) - 1, 60).astype(int)
     means, colors = [], []
     for view in views:
         pixels = np.stack(
-            [rng.integers(0, side, n_gaussians // len(views) + 1) for side in held.size[::-1]], 1
+            [rng.integers(0, side, n_gaussians // len(views) + 1) for side in photos.size[::-1]], 1
         )
-        means.append(unproject(held.depth[view], held.Ks[view], held.cam_from_world[view], pixels))
-        colors.append(held.images[view][pixels[:, 0], pixels[:, 1]])
+        means.append(
+            unproject(photos.depth[view], photos.Ks[view], photos.cam_from_world[view], pixels)
+        )
+        colors.append(photos.images[view][pixels[:, 0], pixels[:, 1]])
     places = np.concatenate(means)[:n_gaussians] + rng.normal(0, 1e-4, (n_gaussians, 3))
     shapes, normals = local_shape(places, 16)
     points = Points(
-        held.names, held.Ks, held.cam_from_world, places, np.concatenate(colors)[:n_gaussians], normals, shapes,
-        np.zeros((0, 2), np.int32), {"how": "depth"},
-    )  # fmt: skip
+        photos.names,
+        photos.Ks,
+        photos.cam_from_world,
+        places,
+        np.concatenate(colors)[:n_gaussians],
+        normals,
+        shapes,
+        np.zeros((0, 2), np.int32),
+        {"how": "depth"},
+    )
     settings = {
         "steps": 3000,
         "semantics": False,
@@ -171,7 +174,7 @@ def measured(capture: Path, n_gaussians: int, device: str = "cpu") -> dict[str, 
         "weight_depth": 0.8,
     }
     config = Config.model_validate({"train": settings})
-    trainer = assemble(job_of(config, {}, device), Inputs(held, points))
+    trainer = assemble(job_of(config, {}, device), Inputs(photos, points))
     trainer.step = int(config.train.steps * 0.1)  # at full resolution, before growth
     steps = trainer.steps()
     for _ in range(WARM):
@@ -190,7 +193,6 @@ def measured(capture: Path, n_gaussians: int, device: str = "cpu") -> dict[str, 
 
 def growth(work: Path, names: Sequence[str], out: Path) -> int:
     """A row for each case, and the exponents; 1 if a thousand views take more than BOUND."""
-    print(f"bar: 1000 views of 1920×1080 within {BOUND:g} GB")
     rows: list[dict[str, Any]] = []
     for name in names:
         for n_gaussians, size, n_views in GROWTH[name]:
@@ -199,7 +201,7 @@ def growth(work: Path, names: Sequence[str], out: Path) -> int:
                 stored = sum(file.stat().st_size for file in capture.rglob("*") if file.is_file())
                 command = [sys.executable, "-m", "benchmarks", "cost", "--work", str(work)]
                 command += ["--case", str(capture), str(n_gaussians)]
-                done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+                process = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
             row = {
                 "row": name,
                 "gaussians": n_gaussians,
@@ -207,21 +209,34 @@ def growth(work: Path, names: Sequence[str], out: Path) -> int:
                 "height": size[1],
                 "views": n_views,
             }
-            rows.append(row | json.loads(done.stdout) | {"disk_gb": stored / 2**30})
-            print("{gaussians:>9,} Gaussians  {width:>4}×{height:<4}  {views:>4} views  "
-                  "{step_ms:7.1f} ms a step  "
-                  "{peak_gb:5.2f} GB  {disk_gb:6.3f} GB on disk".format(**rows[-1]), flush=True)  # fmt: skip
+            rows.append(row | json.loads(process.stdout) | {"disk_gb": stored / 2**30})
+            print(
+                "{gaussians:>9,} Gaussians  {width:>4}×{height:<4}  {views:>4} views  "
+                "{step_ms:7.1f} ms a step  {peak_gb:5.2f} GB  {disk_gb:6.3f} GB on disk".format(
+                    **rows[-1]
+                ),
+                flush=True,
+            )
         first, last = ([row for row in rows if row["row"] == name][k] for k in (0, -1))
         if first is not last:
-            grown = {"Gaussians": last["gaussians"] / first["gaussians"], "views": last["views"] / first["views"],
-                     "pixels": last["width"] * last["height"] / (first["width"] * first["height"])}[name]  # fmt: skip
+            sizes = [
+                {
+                    "Gaussians": row["gaussians"],
+                    "views": row["views"],
+                    "pixels": row["width"] * row["height"],
+                }[name]
+                for row in (first, last)
+            ]
+            grown = sizes[1] / sizes[0]
             slopes = (
                 math.log(last[key] / first[key]) / math.log(grown)
                 for key in ("step_ms", "peak_gb", "disk_gb")
             )
             print("with {}: step ^{:.2f}, memory ^{:.2f}, disk ^{:.2f}".format(name, *slopes))
     shared.write_csv(out / "growth.csv", rows)
-    return int(any(row["peak_gb"] > BOUND for row in rows if row["views"] == 1000))
+    largest = [row["peak_gb"] for row in rows if row["views"] == 1000]
+    bars: list[shared.Bar] = [("GB, 1000 views of 1920×1080", of, "<=", BOUND) for of in largest]
+    return int(not all(shared.judged(bars)))
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -240,5 +255,4 @@ def main(arguments: Sequence[str]) -> int:
     if options.growth:
         return growth(options.work, options.growth, options.out)
     ratio = by_turns(options.work, ("plain", "full", *options.ablations), options.steps)["full"]
-    print(f"full ×{ratio:.2f} (bar {BAR}){'' if ratio <= BAR else ' MISSED'}")
-    return int(ratio > BAR)
+    return int(not all(shared.judged([("full over plain", ratio, "<=", BAR)])))

@@ -1,12 +1,11 @@
 """office0 trained on a GPU, beside the CPU and beside plain 3DGS through gsplat.
 
 Rows of gpu.csv: a training each, with its seconds, PSNR and mIoU on the test views, and the most
-  memory that tensors
-have taken until then; frames a second of our scene by this project's renderer and of plain 3DGS by
-gsplat's own, by turns, the images copied back. Then the launches of a step, by the profiler; one
-step of scenes of 20,000, 200,000 and 1,000,000 Gaussians, ours, and gsplat's own with and without
-packing; one of large photos; and a short training twice: gsplat adds gradients up in the order in
-which threads arrive.
+memory that tensors have taken until then; frames a second of our scene by this project's renderer
+and of plain 3DGS by gsplat's own, by turns, the images copied back. Then the launches of a step, by
+the profiler; one step of scenes of 20,000, 200,000 and 1,000,000 Gaussians, ours, and gsplat's own
+with and without packing; one of large photos; and a short training twice: gsplat adds gradients up
+in the order in which threads arrive.
 """
 
 from __future__ import annotations
@@ -70,19 +69,21 @@ def main(arguments: Sequence[str]) -> int:
 
     def add(row: dict[str, Any]) -> None:
         rows.append(row)
-        shown = (
+        cells = (
             (key, f"{value:.5g}" if isinstance(value, float) else value)
             for key, value in row.items()
         )
-        print("  ".join(f"{key} {value}" for key, value in shown), flush=True)
+        print("  ".join(f"{key} {value}" for key, value in cells), flush=True)
         shared.write_csv(options.out / "gpu.csv", rows)  # what was measured stays, whatever comes
 
     with tempfile.TemporaryDirectory() as folder:
-        found = {}
+        by_name = {}
         for name, (ablation, steps, device) in RUNS.items():
-            found[name] = trained(options.work, Path(folder) / name, name, ablation, steps, device)
-            add(found[name])
-        on_gpu, longer, on_cpu, _ = (found[name] for name in RUNS)
+            by_name[name] = trained(
+                options.work, Path(folder) / name, name, ablation, steps, device
+            )
+            add(by_name[name])
+        on_gpu, longer, on_cpu, _ = (by_name[name] for name in RUNS)
         ours, plain = (
             Scene.read(Path(folder) / name / "export") for name in ("GPU", "plain 3DGS, GPU")
         )
@@ -116,9 +117,7 @@ def main(arguments: Sequence[str]) -> int:
 def trained(
     work: Path, out: Path, name: str, ablation: str, steps: int, device: str
 ) -> dict[str, Any]:
-    """A training's row: from a scene that is there up to its teacher to its evaluation, in this
-    process.
-    """
+    """A training's row, from a scene's teacher to its evaluation, in this process."""
     values = read_toml("ablations", ablation) if ablation else {}
     config = out.with_suffix(".json")
     config.write_text(json.dumps(values | {"train": values.get("train", {}) | {"steps": steps}}))
@@ -178,7 +177,7 @@ def by_turns(
                 render(view)
             seconds[name].append(time.perf_counter() - began)
     row = {"what": "frames a second", "device": torch.cuda.get_device_name()}
-    return row | {name: len(views) / min(taken[1:]) for name, taken in seconds.items()}
+    return row | {name: len(views) / min(rounds[1:]) for name, rounds in seconds.items()}
 
 
 def by_ours(scene: Scene) -> Callable[[View], np.ndarray]:
@@ -208,16 +207,14 @@ def by_gsplat(scene: Scene) -> Callable[[View], np.ndarray]:
     def render(view: View) -> np.ndarray:
         camera = view.viewmat[None], view.K[None], view.width, view.height
         image = gsplat.rasterization(*gaussians, *camera, sh_degree=degree, packed=False)[0][0]
-        shown: np.ndarray = (image.clamp(0, 1) * 255).round().byte().cpu().numpy()
-        return shown
+        pixels: np.ndarray = (image.clamp(0, 1) * 255).round().byte().cpu().numpy()
+        return pixels
 
     return render
 
 
 def launches(work: Path) -> dict[str, Any]:
-    """Launches of a step that are not gsplat's, and milliseconds of a step and of its kernels, once
-    growth is over.
-    """
+    """Launches of a step but gsplat's, milliseconds of it and of its kernels, after growth."""
     trainer = trainer_from(
         work, Config(train=TrainSection(steps=STEPS, densify_until=0.3)), device=DEVICE
     )
@@ -316,9 +313,7 @@ def step(n: int, packed: bool | None) -> dict[str, Any]:
 
 
 def large(work: Path, folder: Path) -> dict[str, Any]:
-    """A step of many Gaussians and large photos, colour and depth, and its memory: of `benchmarks
-    cost --growth`.
-    """
+    """A step of many Gaussians and large photos, and its memory: of `benchmarks cost --growth`."""
     n, size, n_views = LARGE
     torch.cuda.empty_cache()
     torch.cuda.reset_peak_memory_stats()
@@ -332,9 +327,7 @@ def large(work: Path, folder: Path) -> dict[str, Any]:
 
 
 def again(work: Path) -> dict[str, Any]:
-    """What two trainings of STEPS steps on the GPU have in common: PSNR of both, and whether bytes
-    are the same.
-    """
+    """PSNR of two trainings of STEPS steps on the GPU; same_bytes: both give the same bytes."""
     trainings = []
     for _ in range(2):
         trainer = trainer_from(work, Config(train=TrainSection(steps=STEPS)), device=DEVICE)

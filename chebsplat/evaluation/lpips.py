@@ -41,16 +41,16 @@ class Lpips:
             elif match := TAP.match(name):
                 tensors["tap", int(match[1])] = tensor.float()
         before = 3
-        wanted: dict[tuple[str, int], tuple[int, ...]] = {}
+        shapes: dict[tuple[str, int], tuple[int, ...]] = {}
         for k, block in enumerate(BLOCKS):
             for layer, channels in block.items():
-                wanted["weight", layer], wanted["bias", layer] = (
+                shapes["weight", layer], shapes["bias", layer] = (
                     (channels, before, 3, 3),
                     (channels,),
                 )
                 before = channels
-            wanted["tap", k] = (1, before, 1, 1)
-        for key, shape in wanted.items():
+            shapes["tap", k] = (1, before, 1, 1)
+        for key, shape in shapes.items():
             title = (
                 f"lin{key[1]}.model.1.weight" if key[0] == "tap" else f"features.{key[1]}.{key[0]}"
             )
@@ -60,7 +60,7 @@ class Lpips:
                 raise ValueError(f"{title} is {tuple(tensors[key].shape)}, not {shape}")
             if not tensors[key].isfinite().all():
                 raise ValueError(f"{title} is not finite")
-        self.tensors = {key: tensors[key] for key in wanted}
+        self.tensors = {key: tensors[key] for key in shapes}
 
     @torch.no_grad()
     def distance(self, image: np.ndarray, truth: np.ndarray) -> float:

@@ -1,6 +1,4 @@
-"""What a scene is measured by: image fidelity, segmentation, and features at points of a
-surface, from arrays alone.
-"""
+"""Figures of a scene from arrays: image fidelity, segmentation, features at points of a surface."""
 
 from __future__ import annotations
 
@@ -93,9 +91,7 @@ def segmentation(matrix: np.ndarray) -> Segmentation:
 
 
 def boundary_band(truth: np.ndarray, half_width: int) -> np.ndarray:
-    """Pixels [H, W] within `half_width` pixels (chessboard) of a pixel with another label, IGNORE
-    edges not counted.
-    """
+    """Pixels [H, W] within `half_width` (chessboard) of another label; IGNORE edges are none."""
     edge = np.zeros(truth.shape, bool)
     for axis in (0, 1):
         ahead, behind = np.moveaxis(truth, axis, 0)[1:], np.moveaxis(truth, axis, 0)[:-1]
@@ -126,7 +122,7 @@ def features_at(
       features:  [N, C].
     Returns: features f32 [M, C], zero where no Gaussian reaches; weights f32 [M], their sums.
     Choices: a Gaussian ends at 3 standard deviations. Nothing occludes anything: what lies in front
-      of a point or behind it by more than that has no say.
+      of a point or behind it by more than that does not count.
     """
     sums, weights = np.zeros((len(points), features.shape[1])), np.zeros(len(points))
     if not len(points) or not len(means):
@@ -153,8 +149,8 @@ def features_at(
 
 
 def thinned(points: np.ndarray) -> np.ndarray:
-    """Which of points [M, 3] are kept: the first of each cell, so that an area counts as often as
-    it is large.
+    """Rows of the first of points [M, 3] in each cell, so that an area counts as often as it is
+    large.
 
     Choices: 128 cells along the longest side of the box that holds 98 % of the points along each
       axis; a stray depth beyond it does not coarsen them.

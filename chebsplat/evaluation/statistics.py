@@ -1,6 +1,4 @@
-"""Means with their spread, and paired differences with an interval: what a study reports of its
-runs.
-"""
+"""Means with their spread, and paired differences with an interval, of the runs of a study."""
 
 from __future__ import annotations
 
@@ -26,11 +24,9 @@ class Summary:
 
 @dataclass(frozen=True)
 class Difference:
-    """A mean paired difference (or ratio), its spread over pairs, and the 95 % interval of the
-    mean.
+    """A mean paired difference (or ratio), its spread over pairs, and its 95 % interval.
 
-    `low`, `high`, `error` are nan with a single unit: then nothing can be said about other scenes
-      or seeds.
+    `low`, `high`, `error` are nan with a single unit, which tests no other scene or seed.
     """
 
     mean: float
@@ -44,14 +40,12 @@ class Difference:
 
     @property
     def excluded(self) -> bool:
-        """Whether the interval excludes "no effect"."""
+        """True where the interval excludes "no effect"."""
         return bool(self.low > self.neutral or self.high < self.neutral)
 
 
 def summarize(values: Values) -> Summary:
-    """Mean ± sample standard deviation of values [N]. Raises ValueError on none, or on a value that
-    is not finite.
-    """
+    """Mean ± sample standard deviation of values [N]. ValueError on none or a non-finite one."""
     values = _finite(values)
     return Summary(
         float(values.mean()),
@@ -70,7 +64,7 @@ def paired_difference(
     Raises: ValueError on no pair, lengths that disagree, a value that is not finite, or a ratio of
       one that is not > 0.
     Choices: seeds of one scene are not independent of each other, so the interval is Student's over
-      the scenes' means; with one scene it is over the seeds, and says nothing about other scenes.
+      the scenes' means; with one scene it is over the seeds, and does not hold for other scenes.
       `error` and `spread` of a ratio are of its logarithm, that is, relative.
     """
     values, baseline = _finite(values), _finite(baseline)

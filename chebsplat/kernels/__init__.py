@@ -1,5 +1,4 @@
-"""What compiled kernels are made of: numba's settings and its cache (`jit`), and explicit vectors
-(`simd`).
+"""Basis of compiled kernels: numba's settings and its cache (`jit`), explicit vectors (`simd`).
 
 A vector is 16 float32, of a contiguous array and an index into it as if it were flat. Imports
 nothing of chebsplat.

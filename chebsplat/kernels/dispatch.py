@@ -1,6 +1,4 @@
-"""Which of two twins computes: a compiled kernel, or plain torch, which takes any device and float
-type.
-"""
+"""Choice between two twins: a compiled kernel, or plain torch for any device and float type."""
 
 from __future__ import annotations
 
@@ -13,8 +11,7 @@ BACKENDS = ("auto", "cpu", "cuda", "reference")
 
 
 def is_compiled(tensor: Tensor, backend: str = "auto") -> bool:
-    """Whether a compiled kernel takes a tensor: float32 on the CPU, unless plain torch is asked for
-    (`reference`).
+    """True where a compiled kernel takes a tensor: float32 on the CPU, `backend` not `reference`.
 
     Raises: ValueError on an unknown backend.
     """
@@ -24,15 +21,12 @@ def is_compiled(tensor: Tensor, backend: str = "auto") -> bool:
 
 
 def gsplat() -> Any:
-    """The package that computes on a GPU, loaded when first asked for. Raises ImportError, with the
-    remedy.
-    """
+    """The package that computes on a GPU, imported on first use. Raises ImportError with remedy."""
     try:
         import gsplat as module
     except ImportError as error:
         raise ImportError(
             "torch sees a GPU, but gsplat, which renders on it, cannot be imported: make setup "
-            "device=cuda; "
-            "or move the tensors to the CPU, or pass backend='reference'"
+            "device=cuda; or move the tensors to the CPU, or pass backend='reference'"
         ) from error
     return module

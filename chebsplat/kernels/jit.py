@@ -1,5 +1,4 @@
-"""The door to numba: how kernels are compiled, where they are kept, and the memory that they work
-in.
+"""Compilation of kernels by numba: its options, the folder of the cache, and memory to work in.
 
 The folder is named for our kernels' source, so that an edited helper is never served stale. It lies
 in the user's cache; CHEBSPLAT_CACHE moves it.
@@ -26,19 +25,19 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLoca
 log = logging.getLogger("chebsplat")
 EVERY = 10.0  # seconds between two lines on what is being compiled
 ROOT = Path(__file__).parents[1]  # of the package
-KEPT = {-3: 32 << 20, -1: 64 << 20}  # bytes, by malloc.h's M_MMAP_THRESHOLD and M_TRIM_THRESHOLD
+MALLOC_BYTES = {-3: 32 << 20, -1: 64 << 20}  # by malloc.h's M_MMAP_THRESHOLD, M_TRIM_THRESHOLD
 
 
 def _keep_freed_memory() -> None:
-    """Let a step's arrays take what the last step's left: memory that went back to the system comes
-    page by page, which is a third of a small step's time. Only glibc is asked, and what the user
-    says to it is left alone.
+    """Let a step's arrays take the memory that the last step's freed: memory given back to the
+    system comes page by page, a third of a small step's time. Of glibc alone; the user's own
+    settings stay.
     """
     if any(name in os.environ for name in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_TRIM_THRESHOLD_")):
         return
     library = ctypes.CDLL(None)
     if hasattr(library, "mallopt"):
-        for option, size in KEPT.items():
+        for option, size in MALLOC_BYTES.items():
             library.mallopt(option, size)
 
 
@@ -54,14 +53,14 @@ def _digest() -> str:
 def _folders() -> list[Path]:
     """Folders for compiled kernels, the best first."""
     name = f"numba-{DIGEST}"
-    chosen, cache, work = (
+    configured, cache, work = (
         os.environ.get(key) for key in ("CHEBSPLAT_CACHE", "XDG_CACHE_HOME", "CHEBSPLAT_WORK")
     )
     user = Path(cache or Path(os.path.expanduser("~")) / ".cache")
-    defaults = [Path(chosen or user / "chebsplat") / name] + (
+    defaults = [Path(configured or user / "chebsplat") / name] + (
         [Path(work) / ".cache" / name] if work else []
     )
-    # numba's word for it; what a user says there is left alone
+    # numba's own setting: a user's value is left alone
     own = os.environ.get("NUMBA_CACHE_DIR")
     return [
         folder for folder in ([Path(own)] if own else []) + defaults if own or folder.is_absolute()
@@ -95,9 +94,8 @@ else:
 
 
 class _ByModule(_CacheLocator):
-    """A kernel's place by its module and source, where numba asks for the file's path and time:
-    another clone of the same source, or one that was moved or checked out again, finds what was
-    compiled.
+    """Place of a kernel by its module and source, where numba takes the file's path and time:
+    another clone of the same source, or one that was moved or checked out again, finds it compiled.
     """
 
     def __init__(self, module: Path, line: int):
@@ -125,9 +123,7 @@ class _KernelFiles(CompileResultCacheImpl):
 
 
 class _KernelCache(FunctionCache):
-    """A kernel's files on disk. A disk that is full costs the keeping, a damaged file another
-    compilation.
-    """
+    """A kernel's files on disk. A full disk leaves it unsaved; a damaged file is compiled anew."""
 
     _impl_class = _KernelFiles
 
@@ -150,14 +146,12 @@ class _KernelCache(FunctionCache):
                 super().save_overload(signature, compiled)
         except OSError as error:
             log.warning("a kernel cannot be kept in %s (%s): it is compiled again next time; "
-                        "CHEBSPLAT_CACHE names "
-                        "another folder", self.cache_path, error.strerror)  # fmt: skip
+                        "CHEBSPLAT_CACHE names another folder", self.cache_path,
+                        error.strerror)  # fmt: skip
 
 
 class _CompilationLog(event.Listener):
-    """Says what is being compiled, now and then: it takes a minute or two, once for each version of
-    the kernels.
-    """
+    """Logs now and then which kernel is compiled: it takes a minute or two for each new version."""
 
     def __init__(self) -> None:
         self.kernels, self.depth = 0, 0
@@ -170,13 +164,13 @@ class _CompilationLog(event.Listener):
         self.depth += 1
         function = started.data["dispatcher"].py_func
         if function.__module__.startswith("chebsplat") and now - self.last >= EVERY:
-            done = (
+            progress = (
                 f"{self.kernels} done in {self.spent(now):.0f} s"
                 if self.kernels
                 else (f"kept in {FOLDER}")
             )
             log.info(
-                "compiling kernels: %s of %s (%s)", function.__name__, function.__module__, done
+                "compiling kernels: %s of %s (%s)", function.__name__, function.__module__, progress
             )
             self.last = now
 

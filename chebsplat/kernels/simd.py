@@ -1,10 +1,9 @@
 """Vectors of float32, of 16 and less, as values inside numba kernels.
 
-numba's loops vectorise only when LLVM proves that nothing aliases; these say it. LLVM splits a
-vector wider than the machine's registers, so the same source runs on AVX-512 (one register), AVX2
+numba's loops vectorise only when LLVM proves that nothing aliases; these need no proof. LLVM splits
+a vector wider than the machine's registers, so the same source runs on AVX-512 (one register), AVX2
 (two), SSE and NEON (four); only a machine without fused multiply-add rounds differently. An array
-argument is contiguous float32, its index counts elements and
-is not checked: the callers lay out every buffer that they pass.
+argument is contiguous float32; its index counts elements and is not checked.
 """
 
 from __future__ import annotations
@@ -218,9 +217,7 @@ def bits(_typing, mask):
 
 @intrinsic
 def scale_by_power(_typing, value, shifted):
-    """value · 2^k, where `shifted` is k + 1.5·2²³, which holds k in its low bits; no over- or
-    underflow.
-    """
+    """value · 2^k, within range; `shifted` is k + 1.5·2²³, which holds k in its low bits."""
 
     def build(context, builder, sig, args):
         whole = ir.VectorType(INT, value.count)
@@ -276,9 +273,7 @@ def exp2(_typing, x):
 
 @intrinsic
 def transpose(_typing, array, source, target, stride):
-    """Copy the transpose of the 16×16 block that begins at `source` to the one at `target`; rows
-    are `stride` apart.
-    """
+    """Copy the transposed 16×16 block at `source` to `target`; rows are `stride` apart."""
 
     def build(context, builder, sig, args):
         array, source, target, stride = args

@@ -1,5 +1,4 @@
-"""How likely a place is what a word means, and whether a scene has it at all: relevancy,
-calibrated.
+"""Calibrated relevancy: how probably a place shows what a word means, and a scene has it at all.
 
 A word is weighed against words that were the nearest of a teacher's vocabulary somewhere in
 generated rooms, its rivals (docs/method.md, section 16). All vectors are of one space; features are
@@ -14,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 CUT = 0.5  # of probabilities: likelier than not
-# one of so many Gaussians, the likeliest ones, tells whether a scene has what was asked for
+# one of so many Gaussians, the likeliest ones, tell whether a scene has what a word means
 STRONGEST = 1000
 LEAST = 5  # of them, at least
-BLOCK = 4_000_000  # cosines that are held at once
+BLOCK = 4_000_000  # cosines in memory at once
 
 
 class Calibration(NamedTuple):
@@ -33,7 +32,7 @@ class Calibration(NamedTuple):
 
 
 def evidence(features: np.ndarray, words: np.ndarray, rivals: np.ndarray) -> np.ndarray:
-    """How far each word is behind the best rival, <= 0 where it is one itself, and its cosine.
+    """Cosine of each word less that of the best rival, <= 0 where it is one itself, and the cosine.
 
     Args: features [..., C] of any length; words [W, C]; rivals [K, C], K >= 1.
     Returns: f32 [..., W, 2]; a feature of length zero has the evidence of no word: nan.
@@ -50,7 +49,7 @@ def evidence(features: np.ndarray, words: np.ndarray, rivals: np.ndarray) -> np.
             f"features {features.shape}, words {words.shape} and rivals {rivals.shape} do not fit"
         )
     rows = features.reshape(-1, n_channels).astype(np.float32)
-    found = np.empty((len(rows), len(words), 2), np.float32)
+    scores = np.empty((len(rows), len(words), 2), np.float32)
     step = max(BLOCK // (len(rivals) + len(words)), 1)
     for start in range(0, len(rows), step):
         part = slice(start, start + step)
@@ -58,31 +57,28 @@ def evidence(features: np.ndarray, words: np.ndarray, rivals: np.ndarray) -> np.
         directions = rows[part] / np.where(lengths > 0, lengths, np.nan)
         cosines = directions @ words.T.astype(np.float32)
         best = (directions @ rivals.T.astype(np.float32)).max(1)
-        found[part] = np.stack([cosines - best[:, None], cosines], 2)
-    return found.reshape(*features.shape[:-1], len(words), 2)
+        scores[part] = np.stack([cosines - best[:, None], cosines], 2)
+    return scores.reshape(*features.shape[:-1], len(words), 2)
 
 
 def probability(
     features: np.ndarray, word: np.ndarray, rivals: np.ndarray, of: Calibration
 ) -> np.ndarray:
-    """How likely each feature [..., C] is what `word` [C] means: f32 [...] in [0, 1]; 0 for a
-    feature of length zero.
+    """Probability f32 [...] that features [..., C] show what `word` [C] means; 0 at length zero.
 
     Raises: ValueError on shapes that do not fit.
     """
     return probable(evidence(features, word[None], rivals)[..., 0, :], of)
 
 
-def probable(found: np.ndarray, of: Calibration) -> np.ndarray:
+def probable(scores: np.ndarray, of: Calibration) -> np.ndarray:
     """Probabilities f32 [...] by the `evidence` [..., 2] of one word; 0 where that is nan."""
-    odds = of.margin * found[..., 0].astype(np.float64) + of.cosine * found[..., 1] + of.bias
+    odds = of.margin * scores[..., 0].astype(np.float64) + of.cosine * scores[..., 1] + of.bias
     return np.where(np.isnan(odds), 0, _share(odds)).astype(np.float32)
 
 
 def strongest(probabilities: np.ndarray) -> float:
-    """Mean log-odds of a scene's likeliest places: one in STRONGEST, LEAST at least. Raises
-    ValueError without any.
-    """
+    """Mean log-odds of the likeliest places, one in STRONGEST, at least LEAST; none: ValueError."""
     if not probabilities.size:
         raise ValueError("a scene of no places has nothing")
     count = min(max(probabilities.size // STRONGEST, LEAST), probabilities.size)
@@ -93,16 +89,12 @@ def strongest(probabilities: np.ndarray) -> float:
 
 
 def presence(probabilities: np.ndarray, of: Calibration) -> float:
-    """How likely a scene, by the probabilities of all its places, has what was asked for; in [0,
-    1].
-    """
+    """Probability that a scene has what a word means, from `probabilities` of all its places."""
     return float(_share(np.array(of.strength * strongest(probabilities) + of.offset)))
 
 
 def frequent(features: Sequence[np.ndarray], words: np.ndarray, least: float) -> np.ndarray:
-    """Rows of the words [W, C] that are the nearest of all to more than a share `least` of the
-    features [N, C] each.
-    """
+    """Rows of words [W, C] nearest to more than a share `least` of all features [N, C]."""
     counts, total = np.zeros(len(words), np.int64), 0
     for rows in features:
         step = max(BLOCK // len(words), 1)
@@ -152,13 +144,11 @@ def _share(odds: np.ndarray) -> np.ndarray:
 def relevancy(
     features: np.ndarray, query: np.ndarray, against: np.ndarray, temperature: float = 0.1
 ) -> np.ndarray:
-    """Smallest, over the phrases it is weighed against, of the share that the query has of the two
-    (LERF, section 3.3).
+    """Smallest share of the query in a softmax with one of the phrases against it (LERF, 3.3).
 
     Args:
       features:    [..., C] of any length.
-      query:       [C] embedding of what is asked for; against: [K, C] of phrases that fit anything,
-        K >= 1.
+      query:       [C] embedding of the query; against: [K, C] of phrases that fit anything, K >= 1.
       temperature: of the softmax over a pair, > 0.
     Returns: f32 [...] in [0, 1]; above 0.5 where the query fits better than every one of the
       phrases.

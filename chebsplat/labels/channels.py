@@ -1,6 +1,4 @@
-"""The linear map from a teacher's channels to the few that scenes are trained in (docs/method.md,
-section 8).
-"""
+"""Linear map from a teacher's channels to the few of a scene (docs/method.md, section 8)."""
 
 from __future__ import annotations
 
@@ -21,9 +19,7 @@ class Moments:
         self.count = 0
 
     def add(self, features: np.ndarray) -> None:
-        """Take in features [..., C]. Raises ValueError on another number of channels or a
-        non-finite value.
-        """
+        """Take in features [..., C]. Raises ValueError on other channels or a non-finite value."""
         rows = features.reshape(-1, features.shape[-1])
         if rows.shape[1] != len(self.products):
             raise ValueError(
@@ -40,12 +36,12 @@ class Moments:
 def channel_map(
     moments: Moments, vocabulary: np.ndarray, n_channels: int, weight: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The directions to keep, by the features' energy and by what tells the vocabulary's words
-    apart.
+    """Directions of the most energy of features and the most difference between a vocabulary's
+    words.
 
     Args:
       moments:    of the reference's features, C channels.
-      vocabulary: [L, C] unit embeddings of the words that a teacher may be asked for.
+      vocabulary: [L, C] unit embeddings of the words of possible queries.
       n_channels: at most; fewer where the features span fewer.
       weight:     of the vocabulary's scatter beside the features' energy, both of trace 1.
     Returns: matrix [C, d] float64 with orthonormal columns, whose transpose is its inverse; energy
@@ -53,15 +49,12 @@ def channel_map(
     Raises: ValueError if there are no features, or all are zero.
     Choices: eigenvectors of second moments, not of covariances, since an inner product with a word
       counts from zero. The vocabulary counts by its scatter about its mean, which is all that a
-      choice between words depends on. Its
-      weight of 1 was chosen among 0, .1, .3, 1, 3 and 10: with 32 of 512 channels (spectra as k^-1
-        and k^-2, words of
-      mean cosine .76) it keeps 93 % of the decisions between 150 words, energy alone 83 %, at a
-      relative error of 24 instead of 22 %; more weight gains nothing. It counts only within the
-      directions that the features span (all
+      choice between words depends on. Its weight of 1 was chosen among 0, .1, .3, 1, 3 and 10: with
+      32 of 512 channels (spectra as k^-1 and k^-2, words of mean cosine .76) it keeps 93 % of the
+      decisions between 150 words, energy alone 83 %, at a relative error of 24 instead of 22 %;
+      more weight gains nothing. It counts only within the directions that the features span (all
       but NEGLIGIBLE of their energy): so a teacher of rank n_channels or less comes through
-        exactly. Signs: the largest
-      entry of a column is positive.
+      exactly. Signs: the largest entry of a column is positive.
     """
     total = np.trace(moments.products)
     if not total > 0:
@@ -77,8 +70,8 @@ def channel_map(
     words = scatter.T @ scatter
     words /= max(np.trace(words), np.finfo(np.float64).tiny)
     inside = span.T @ features @ span
-    kept = span @ np.linalg.eigh(inside + weight * words)[1][:, ::-1]
-    matrix = np.concatenate([kept, axes[:, : -span.shape[1]][:, ::-1]], 1)
+    directions = span @ np.linalg.eigh(inside + weight * words)[1][:, ::-1]
+    matrix = np.concatenate([directions, axes[:, : -span.shape[1]][:, ::-1]], 1)
     largest = np.take_along_axis(matrix, np.abs(matrix).argmax(0)[None], 0)
     matrix = matrix * np.where(largest < 0, -1.0, 1.0)
     energy = np.cumsum((matrix * (features @ matrix)).sum(0))
@@ -86,13 +79,11 @@ def channel_map(
 
 
 def agreement(features: np.ndarray, words: np.ndarray, matrix: np.ndarray) -> float:
-    """Share of features [N, C] whose word of the largest inner product, of [L, C], is the same in
-    the few.
-    """
-    kept, few = words @ matrix, features @ matrix
+    """Share of features [N, C] whose nearest word of [L, C], by product, the map keeps the same."""
+    mapped_words, mapped = words @ matrix, features @ matrix
     same = [
         (features[start : start + ROWS] @ words.T).argmax(1)
-        == (few[start : start + ROWS] @ kept.T).argmax(1)
+        == (mapped[start : start + ROWS] @ mapped_words.T).argmax(1)
         for start in range(0, len(features), ROWS)
     ]
     return float(np.concatenate(same).mean())

@@ -14,18 +14,15 @@ from collections.abc import Iterator
 import numpy as np
 
 TEMPERATURE = 0.1  # of cosines
-BLOCK = 4_000_000  # cosines that are held at once
+BLOCK = 4_000_000  # cosines in memory at once
 IGNORE = -1
-# Names met in indoor datasets; the codes of these repel one another, others are placed where room
-# is left.
+# Names in indoor datasets; their codes repel one another, those of other names lie between them.
 _NAMES = (
     "wall floor ceiling door window blinds desk table chair sofa cabinet shelf monitor keyboard "
-    "lamp bin rug plant "
-    "clock picture book cushion bed pillow blanket curtain counter refrigerator television toilet "
-    "sink bathtub mirror "
-    "shower stool bench box bag bottle vase basket stove oven microwave dishwasher faucet fan "
-    "radiator stairs pillar "
-    "tv-screen nightstand armchair wardrobe towel bowl plate cup screen switch vent painting"
+    "lamp bin rug plant clock picture book cushion bed pillow blanket curtain counter "
+    "refrigerator television toilet sink bathtub mirror shower stool bench box bag bottle vase "
+    "basket stove oven microwave dishwasher faucet fan radiator stairs pillar tv-screen "
+    "nightstand armchair wardrobe towel bowl plate cup screen switch vent painting"
 )
 VOCABULARY = tuple(_NAMES.split())
 
@@ -56,20 +53,16 @@ def decode_labels(features: np.ndarray, embeddings: np.ndarray) -> np.ndarray:
 def shares(
     features: np.ndarray, embeddings: np.ndarray, temperature: float = TEMPERATURE
 ) -> np.ndarray:
-    """How likely each label is, f32 [..., L], rows of sum 1: the softmax that `decode` takes the
-    largest entry of.
-    """
-    found = np.zeros((*features.shape[:-1], len(embeddings)), np.float32)
+    """Probability of each label, f32 [..., L], of sum 1: a softmax; `decode` takes its maximum."""
+    probabilities = np.zeros((*features.shape[:-1], len(embeddings)), np.float32)
     for rows, cosines in _cosines(features, embeddings):
         weights = np.exp((cosines - cosines.max(-1, keepdims=True)) / temperature)
-        found.reshape(-1, len(embeddings))[rows] = weights / weights.sum(-1, keepdims=True)
-    return found
+        probabilities.reshape(-1, len(embeddings))[rows] = weights / weights.sum(-1, keepdims=True)
+    return probabilities
 
 
 def _cosines(features: np.ndarray, embeddings: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
-    """(rows, their cosines [n, L]), BLOCK numbers at a time, so that thousands of labels do not
-    cost gigabytes.
-    """
+    """(rows, their cosines [n, L]), BLOCK numbers at a time, so that many labels fit in memory."""
     rows = features.reshape(-1, features.shape[-1])
     step = max(BLOCK // len(embeddings), 1)
     for start in range(0, len(rows), step):
@@ -118,12 +111,12 @@ def class_codes(names: list[str], n_channels: int) -> np.ndarray:
     if n_channels < 2:
         raise ValueError("n_channels must be at least 2")
     frame = _frame(n_channels)
-    known = dict(zip(VOCABULARY, frame, strict=True))
-    rows = [known[name] if name in known else _placed(name, frame) for name in names]
+    code_of = dict(zip(VOCABULARY, frame, strict=True))
+    rows = [code_of[name] if name in code_of else _draw_code(name, frame) for name in names]
     return np.asarray(rows, np.float32).reshape(len(names), n_channels)
 
 
-def _placed(name: str, frame: np.ndarray) -> np.ndarray:
+def _draw_code(name: str, frame: np.ndarray) -> np.ndarray:
     """Of 512 vectors drawn from the name's hash, the one least like any of the vocabulary."""
     seed = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big")
     drawn = _unit(np.random.default_rng(seed).normal(size=(512, frame.shape[1])))

@@ -1,6 +1,4 @@
-"""The noisy-labels teacher: a 2D teacher of known error, for controlled studies (docs/method.md,
-section 9).
-"""
+"""The noisy-labels teacher: 2D labels of known error, for studies (docs/method.md, section 9)."""
 
 from __future__ import annotations
 
@@ -12,22 +10,20 @@ IGNORE = -1
 
 def class_colors(images: np.ndarray, labels: np.ndarray, n_classes: int) -> np.ndarray:
     """Mean colour [L, 3] in [0, 1] of each class; nan for a class that does not occur."""
-    kept = labels != IGNORE
-    flat = labels[kept].astype(np.int64)
+    labelled = labels != IGNORE
+    flat = labels[labelled].astype(np.int64)
     counts = np.bincount(flat, minlength=n_classes)
     sums = np.stack(
-        [np.bincount(flat, images[..., c][kept] / 255.0, n_classes) for c in range(3)], 1
+        [np.bincount(flat, images[..., c][labelled] / 255.0, n_classes) for c in range(3)], 1
     )
     return np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], np.nan)
 
 
 def confusable(colors: np.ndarray, width: float = 0.15) -> np.ndarray:
-    """Probability [L, L] that a class is taken for another, by likeness of their colours; rows sum
-    to 1 or 0.
+    """Probability [L, L] that a class is taken for another of like colour; rows sum to 1 or 0.
 
     Choices: a Gaussian of the colour distance, `width` in units of full intensity, plus 1e-6 so
-      that every class
-    that occurs has somebody to be taken for.
+      that every class that occurs can be confused with another.
     """
     distance = np.linalg.norm(colors[:, None] - colors[None], axis=-1)
     weights = np.where(np.isfinite(distance), np.exp(-0.5 * (distance / width) ** 2) + 1e-6, 0.0)
@@ -71,8 +67,8 @@ def confuse_segments(
         swapped = generator.random(count) < p
         if probabilities[value].sum() > 0:
             others = generator.choice(len(probabilities), count, p=probabilities[value])
-            taken = np.concatenate([[False], swapped])[segments]
-            confused[taken] = np.concatenate([[0], others])[segments][taken]
+            pixels = np.concatenate([[False], swapped])[segments]
+            confused[pixels] = np.concatenate([[0], others])[segments][pixels]
     return confused
 
 
@@ -83,8 +79,7 @@ def noisy_features(
     noise: float,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Unit features [h, w, C]: code vectors of labels, blurred over boundaries, with Gaussian
-    noise.
+    """Unit features [h, w, C]: codes of labels, blurred over boundaries, with Gaussian noise.
 
     Args: labels [h, w], class_codes [L, C] unit; blur: sigma in feature pixels; noise: deviation a
       channel.
@@ -96,5 +91,5 @@ def noisy_features(
         features = gaussian_filter(features, (blur, blur, 0))
     features = features + generator.normal(0, noise, features.shape)
     unit = features / np.linalg.norm(features, axis=-1, keepdims=True).clip(1e-6)
-    kept: np.ndarray = np.where((labels != IGNORE)[..., None], unit, 0.0)
-    return kept
+    masked: np.ndarray = np.where((labels != IGNORE)[..., None], unit, 0.0)
+    return masked

@@ -1,4 +1,4 @@
-"""Evidence, without true labels, that what a teacher says of photos makes sense: how much of it
+"""Evidence, without true labels, that a teacher's labels of photos make sense: how much of them
 outlives a change of a photo, where in the map such a change is seen, and whether what lies above is
 called so.
 """
@@ -10,24 +10,14 @@ from scipy.special import entr, rel_entr, softmax
 
 SHARPNESS = 2.0  # of a softmax of values whose standard deviation is 1
 ABOVE = frozenset(("ceiling", "sky"))
-BELOW = frozenset(
-    (
-        "carpet",
-        "earth",
-        "field",
-        "floor",
-        "grass",
-        "ground",
-        "path",
-        "road",
-        "rug",
-        "sand",
-        "sidewalk",
-    )
-)
+BELOW = frozenset((
+    "carpet", "earth", "field", "floor", "grass", "ground", "path", "road", "rug", "sand",
+    "sidewalk",
+))  # fmt: skip
 OUTDOORS = frozenset((
-    "boat", "bridge", "building", "bus", "car", "earth", "fence", "field", "grass", "hill", "house", "mountain", "path",
-    "river", "road", "rock", "sand", "sea", "sidewalk", "sky", "skyscraper", "snow", "tree", "truck", "water",
+    "boat", "bridge", "building", "bus", "car", "earth", "fence", "field", "grass", "hill", "house",
+    "mountain", "path", "river", "road", "rock", "sand", "sea", "sidewalk", "sky", "skyscraper",
+    "snow", "tree", "truck", "water",
 ))  # fmt: skip
 QUARTERS = ("top left", "top right", "bottom left", "bottom right")
 
@@ -45,7 +35,7 @@ def soft(values: np.ndarray, deviation: float) -> np.ndarray:
 
 def information(first: np.ndarray, second: np.ndarray) -> float:
     """Mutual information, nats, of the labels that shares [V, L, h, w] of the same pixels give:
-    none where one label is said of everything, or where a label depends on how a photo was taken.
+    none where all has one label, or where a label depends on how a photo was taken.
     """
     a, b = (
         np.moveaxis(shares, 1, 0).reshape(shares.shape[1], -1).astype(np.float64)

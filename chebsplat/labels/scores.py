@@ -1,6 +1,4 @@
-"""Kinds of a segmenter's outputs, told by their values, and the probabilities that they stand
-for.
-"""
+"""Kinds of a segmenter's outputs, told by their values, and the probabilities they stand for."""
 
 from __future__ import annotations
 
@@ -24,7 +22,7 @@ def kind_of(maps: Sequence[np.ndarray]) -> str:
 
     Choices: sums of 1 over the classes are a softmax, whatever a resize made of its range; values
       of 0 to 1 are sigmoids if some class is surer than SURE; what else stays within -1 to 1 is
-      cosines. Logits that small would say nothing: scaled as cosines, they keep their order.
+      cosines. Logits that small decide nothing: scaled as cosines, they keep their order.
     """
     low, high = min(values.min() for values in maps), max(values.max() for values in maps)
     if all((np.abs(values.sum(0) - 1) < SUM).all() for values in maps):
@@ -56,5 +54,5 @@ def probabilities(values: np.ndarray, kind: str) -> np.ndarray:
 
 
 def sureness(confidence: float, n_classes: int) -> float:
-    """How sure a mean confidence is: 0 where all classes are alike, 1 where one is certain."""
+    """Certainty of a mean confidence: 0 where all classes are alike, 1 where one is certain."""
     return (confidence * n_classes - 1) / (n_classes - 1) if n_classes > 1 else 1.0

@@ -1,6 +1,4 @@
-"""One map of a whole image from the maps of its windows: overlapping, smoothly blended, on any
-grid.
-"""
+"""One map of a whole image from overlapping maps of its windows, smoothly blended, on any grid."""
 
 from __future__ import annotations
 
@@ -13,9 +11,7 @@ OVERLAP = 1 / 3  # of a window, at least: the stride of 2/3 that segmenters are 
 
 
 def window_starts(length: int, window: int) -> list[int]:
-    """First pixels of windows that cover [0, length) evenly; one window at 0 where it is long
-    enough.
-    """
+    """First pixels of windows that cover [0, length) evenly; 0 alone where one is long enough."""
     if length <= window:
         return [0]
     count = math.ceil((length - window) / (window * (1 - OVERLAP))) + 1
@@ -54,8 +50,8 @@ def blended(
     window: tuple[int, int],
     grid: tuple[int, int],
 ) -> np.ndarray:
-    """The map [h, w, C] over an image of `size` (H, W), h x w = `grid`, as a weighted mean of its
-    windows' maps.
+    """The map [h, w, C] of an image of `size` (H, W) on `grid` (h, w): weighted mean of the
+    windows'.
 
     Args: window_map: (top, left) -> [C, hc, wc], the map of the window whose first pixel that is;
       what of it lies beyond the image is padding.

@@ -38,13 +38,13 @@ def prism(corners: np.ndarray, bottom: float, top: float) -> Volume:
 
 
 def holder(points: np.ndarray, volumes: Sequence[Volume], margin: float) -> np.ndarray:
-    """Which of the volumes holds each point [N, 3]: i32 [N], -1 none.
+    """Index of the volume that holds each point [N, 3]: i32 [N], -1 none.
 
     Args: margin: how far outside of a volume a point may lie, in the points' unit.
     Choices: of volumes that overlap the first; of those that a point lies just outside of, the
       nearest.
     """
-    held, best = np.full(len(points), -1, np.int32), np.full(len(points), np.inf)
+    owner, best = np.full(len(points), -1, np.int32), np.full(len(points), np.inf)
     columns = np.ascontiguousarray(points.T)
     for row, (faces, low, high) in enumerate(volumes):
         near = np.arange(len(points))
@@ -53,5 +53,5 @@ def holder(points: np.ndarray, volumes: Sequence[Volume], margin: float) -> np.n
             near = near[(values >= low[axis] - margin) & (values <= high[axis] + margin)]
         outside = np.maximum((points[near] @ faces[:, :3].T + faces[:, 3]).max(1), 0.0)
         nearer = (outside <= margin) & (outside < best[near])
-        best[near[nearer]], held[near[nearer]] = outside[nearer], row
-    return held
+        best[near[nearer]], owner[near[nearer]] = outside[nearer], row
+    return owner

@@ -1,6 +1,4 @@
-"""What views say of points of a surface: the mean of their unit features over the views that see a
-point.
-"""
+"""Mean of the teacher's unit features at points of a surface, over the views that see a point."""
 
 from __future__ import annotations
 
@@ -31,14 +29,14 @@ def averaged(
     Args:
       means:    [N, 3] scene units; unit: scene units in a metre.
       depth:    of each view, [H, W] scene units; nan or 0: unknown, where a view sees nothing.
-      features: of each view, [h, w, n_channels = d]; a row of zeros says nothing. Read view by
+      features: of each view, [h, w, n_channels = d]; a row of zeros does not count. Read view by
         view.
       Ks:       [V, 3, 3] pixels of the depth; poses [V, 4, 4] camera from world.
       within:   metres, and share of the depth, by which a point may lie off what a view sees.
     """
     total, n_views = np.zeros((len(means), n_channels), np.float32), np.zeros(len(means), np.int64)
-    for z_of, said, K, pose in zip(depth, features, Ks, poses, strict=True):
-        (height, width), (rows, columns) = z_of.shape, said.shape[:2]
+    for z_of, grid, K, pose in zip(depth, features, Ks, poses, strict=True):
+        (height, width), (rows, columns) = z_of.shape, grid.shape[:2]
         camera = means @ pose[:3, :3].T + pose[:3, 3]
         z = np.maximum(camera[:, 2], 1e-6 * unit)
         u, v = ((camera / z[:, None]) @ K.T)[:, :2].T
@@ -47,11 +45,11 @@ def averaged(
         hit = z_of[v[index].astype(int), u[index].astype(int)]
         near = np.abs(hit - z[index]) < within[0] * unit + within[1] * z[index]
         index = index[(hit > 0) & near]
-        seen = said[
+        values = grid[
             (v[index] * rows / height).astype(int), (u[index] * columns / width).astype(int)
         ].astype(np.float32)
-        lengths = np.linalg.norm(seen, axis=1)
-        index, seen = index[lengths > 0], seen[lengths > 0] / lengths[lengths > 0, None]
-        total[index] += seen
+        lengths = np.linalg.norm(values, axis=1)
+        index, values = index[lengths > 0], values[lengths > 0] / lengths[lengths > 0, None]
+        total[index] += values
         n_views[index] += 1
     return total / np.maximum(n_views, 1)[:, None], n_views

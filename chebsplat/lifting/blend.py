@@ -1,6 +1,4 @@
-"""What the views say of a Gaussian and what is known beforehand, blended by evidence (the start of
-Eq 10's gate).
-"""
+"""Blend of the views' features with prior knowledge, by evidence (the start of Eq 10's gate)."""
 
 from __future__ import annotations
 
@@ -17,15 +15,14 @@ ALIKE = 0.2  # correlation of the errors of two views of a thing
 SURE = 3  # power of its length by which knowledge counts
 # power by which views count of how far their halves agree, and of how sure they are beside shape
 AGREED = 6
-# What a teacher gets wrong alike in both halves counts as right when they are asked, however many
-# views there are.
+# An error that a teacher repeats in both halves counts as agreement, however many views there are.
 LEAST = 1.0  # strength
-BELIEVED = 0.6, 0.7  # share of labels that shape has alike with a teacher who knows the scene
+BELIEVED = 0.6, 0.7  # share of labels of shape that equal those of a teacher sure of the scene
 LEAST_SHARE = 0.5  # strength, in mean evidence of a Gaussian that is seen
 
 
 class Calibration(NamedTuple):
-    """What the training views decide.
+    """Choices that the training views decide.
 
     smooth:   features are smoothed before they are blended.
     strength: k, views that knowledge counts for; 0: it is left out.
@@ -54,16 +51,15 @@ def blend(
 def trusted(knowledge: np.ndarray, strength: float) -> np.ndarray:
     """k' = k |g|^SURE: views that knowledge counts for, f32 [N].
 
-    Choices: an answer is the mean of unit vectors of a teacher over views, so that its length says
-      how alike these were where shapes were like this one; small things, of which shape says least,
-      are left to the views.
+    Choices: an answer is the mean of unit vectors of a teacher over views, so that its length is
+      how alike these were where shapes were like this one; small things, of which shape reveals
+      least, are left to the views.
     """
     return np.asarray(strength * lengths(knowledge).clip(0, 1) ** SURE, np.float32)
 
 
 def effective(n_views: np.ndarray) -> np.ndarray:
-    """n' = n / (1 + ALIKE (n - 1)): how many views with errors of their own n views are worth, f32
-    [N].
+    """n' = n / (1 + ALIKE (n - 1)): independent views that n views are worth, f32 [N].
 
     Choices: a teacher errs alike in neighbouring views, so that a hundred of them never count for
       more than five.
@@ -73,14 +69,13 @@ def effective(n_views: np.ndarray) -> np.ndarray:
 
 
 def reliable(halves: np.ndarray, half_views: np.ndarray) -> np.ndarray:
-    """ρ^AGREED, f32 [N]: what views count for where half of them agree with the other half by a
-    cosine of ρ.
+    """ρ^AGREED, f32 [N]: weight of views whose two halves agree by a cosine of ρ.
 
     Args: halves [2, N, C], features by each half of the views; half_views [2, N] how many of them
       see each.
     Choices: the mean ρ where only one half sees a Gaussian, 1 where none is seen by both. Views
       whose errors are their own agree in their means however wrong each is; a teacher out of its
-      depth says other things from elsewhere.
+      depth gives other labels from elsewhere.
     """
     both, agreed = (half_views > 0).all(0), cosines(*halves).clip(0, 1)
     mean = float(agreed[both].mean()) if both.any() else 1.0
@@ -88,23 +83,23 @@ def reliable(halves: np.ndarray, half_views: np.ndarray) -> np.ndarray:
 
 
 def familiar(lifted: np.ndarray, knowledge: np.ndarray, embeddings: np.ndarray) -> float:
-    """σ^AGREED, σ = min(c / c', 1): what a scene's views count for that are sure of labels by c,
-    where shape is by c'.
+    """σ^AGREED, σ = min(c / c', 1): weight of views that are sure of labels by c, where shape is by
+    c'.
 
-    Args: lifted [N, C], what the views say of Gaussians, zero where none sees one; knowledge [N,
-      C]; embeddings [L, C]
-          of the scene's labels.
+    Args: lifted [N, C], the views' features of Gaussians, zero where unseen; knowledge [N, C];
+      embeddings [L, C] of the scene's labels.
     Returns: in (0, 1]; 1 where no view sees a Gaussian.
-    Choices: c and c' are mean confidences of `decode`. Views that agree may agree in what none of
-      them knows: a teacher shown a world that it was not taught is between labels, wherever it
-        looks from. Of a scene, not of a Gaussian:
-      small things have no sure label in either, and are the views' to tell. Gaussians that no view
-      sees are not asked: few photos leave many, which says nothing of the teacher.
+    Choices: c and c' are mean confidences of `decode`. Views may agree and all be wrong: a teacher
+      far from what it was trained on is unsure of labels from everywhere. Of a scene, not of a
+      Gaussian: small things have no sure label in either, and are the views' to tell. Gaussians
+      that no view sees do not count: few photos leave many, which is not the teacher's fault.
     """
-    seen = lifted.any(1)
-    if not seen.any():
+    visible = lifted.any(1)
+    if not visible.any():
         return 1.0
-    sure, beside = (float(decode(rows[seen], embeddings)[1].mean()) for rows in (lifted, knowledge))
+    sure, beside = (
+        float(decode(rows[visible], embeddings)[1].mean()) for rows in (lifted, knowledge)
+    )
     return min(sure / beside, 1.0) ** AGREED
 
 
@@ -115,28 +110,28 @@ def believed(
     embeddings: np.ndarray,
     worth: float,
 ) -> float:
-    """How far shape is believed in a scene, in [0, 1], before its strength is chosen.
+    """Trust in shape in a scene, in [0, 1], before its strength is chosen.
 
     Args: as for `familiar`; n_views [N] that see each Gaussian; worth: of `familiar`.
     Choices: where a teacher knows the scene and many labels of shape, weighed by how sure it is of
-      them, are not
-      its own, it is shape that is wrong: another world than it was taught in. Below BELIEVED it has
-        no say, above it
-      all. A teacher that is unsure of the scene is no judge.
+      them, are not its own, it is shape that is wrong: another world than it was taught in. Below
+      BELIEVED the trust is 0, above it 1. A teacher that is unsure of the scene is no judge.
     """
-    seen = (n_views >= 2) & lifted.any(1)
-    if not seen.any():
+    visible = (n_views >= 2) & lifted.any(1)
+    if not visible.any():
         return 1.0
-    alike = decode_labels(lifted[seen], embeddings) == decode_labels(knowledge[seen], embeddings)
-    sure = trusted(knowledge[seen], 1.0)
+    alike = decode_labels(lifted[visible], embeddings) == decode_labels(
+        knowledge[visible], embeddings
+    )
+    sure = trusted(knowledge[visible], 1.0)
     share = float(alike @ sure / max(float(sure.sum()), 1e-12))
     alike_enough = float(np.clip((share - BELIEVED[0]) / (BELIEVED[1] - BELIEVED[0]), 0, 1))
     return max(alike_enough, 1 - worth)
 
 
 def halves_agree(halves: np.ndarray, half_views: np.ndarray) -> float:
-    """How far half of the training views tell what the other half says: mean cosine, as `calibrate`
-    has it, of features as they are. 0 without a Gaussian that both see.
+    """Agreement of the two halves of the training views: mean cosine, as in `calibrate`, of
+    features as they are. 0 without a Gaussian that both see.
 
     Args: halves [2, N, C], features by each half; half_views [2, N] how many of them see each.
     """
@@ -150,22 +145,20 @@ def calibrate(
     near: Affinities,
     knowledge: np.ndarray | None = None,
 ) -> Calibration:
-    """Whether to smooth and how far to trust knowledge: what makes half the training views agree
-    with the other half.
+    """Choice of smoothing and of knowledge's strength: those by which half the views predict the
+    rest.
 
     Args: halves [2, N, C], features by each half of the training views; half_views [2, N] how many
-      of them see each;
-          near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing is decided.
+      of them see each; near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing
+      is decided.
     Returns: whether smoothing alone makes the halves agree better, and the strength at which they
       agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up. Agreement is the
       cosine between what is made of one half (smoothed, blended by its own views) and the other
       half's mean features, averaged over the Gaussians that both see, by the other half's views,
       both ways alike.
     Choices: no test view is looked at, and no label. On ties, and without a Gaussian that both
-      halves see, what changes
-      less wins. The strength is that for features as they are: what smoothing has made of a half is
-        no longer evidence
-      of its views alone, and asks for less.
+      halves see, what changes less wins. The strength is that for features as they are: what
+      smoothing has made of a half is no longer evidence of its views alone, and asks for less.
     """
     strengths, reliability = (
         STRENGTHS if knowledge is not None else STRENGTHS[:1],
@@ -174,7 +167,7 @@ def calibrate(
     weights = np.where((half_views > 0).all(0), half_views, 0).astype(np.float64)
     curve: dict[str, dict[float, float]] = {"off": {}, "on": {}}
     for name in curve:
-        made = [
+        variants = [
             smooth(*of, near) if name == "on" else of[0]
             for of in zip(halves, half_views, strict=True)
         ]
@@ -182,21 +175,23 @@ def calibrate(
             agreed = 0.0
             for own, other in ((0, 1), (1, 0)):
                 evidence = effective(half_views[own]) * reliability
-                result = (
-                    made[own] if knowledge is None else blend(made[own], evidence, knowledge, k)
+                blended = (
+                    variants[own]
+                    if knowledge is None
+                    else blend(variants[own], evidence, knowledge, k)
                 )
-                agreed += float(weights[other] @ cosines(result, halves[other]))
+                agreed += float(weights[other] @ cosines(blended, halves[other]))
             curve[name][k] = agreed / max(float(weights.sum()), 1.0)
-    evidence, seen = effective(half_views.sum(0)) * reliability, half_views.any(0)
-    least = max(LEAST, LEAST_SHARE * float(evidence[seen].mean())) if weights.any() else math.inf
+    evidence, visible = effective(half_views.sum(0)) * reliability, half_views.any(0)
+    least = max(LEAST, LEAST_SHARE * float(evidence[visible].mean())) if weights.any() else math.inf
     tried = [k for k in strengths if k >= least]
     strength = max(tried, key=lambda k: (curve["off"][k], -k), default=0.0)
     return Calibration(curve["on"][0.0] > curve["off"][0.0], strength, curve)
 
 
 def start(which: str, lifted: np.ndarray, trained: np.ndarray | None) -> np.ndarray:
-    """What is refined: lifted or trained features [N, C], or, for `both`, their mean direction, as
-    long as the trained.
+    """Features [N, C] to refine: lifted, trained, or for `both` their mean direction, trained's
+    length.
 
     Choices: training fits features to pictures, single views' errors too; lifting asks all views
       alike, and knows no picture. They err differently, so that their mean errs less.
@@ -217,8 +212,8 @@ def confidence(
     strength: float = 0.0,
     worth: float = 1.0,
 ) -> np.ndarray:
-    """How long the mean of all votes is beside one for nothing: |n' r f/|f| + k' g/|g|| / (n' + k'
-    + 1), f32 [N].
+    """Length of the mean of all votes and a zero one: |n' r f/|f| + k' g/|g|| / (n' + k' + 1), f32
+    [N].
 
     Args: agreement r [N] in [0, 1] of the views; worth: of `familiar`, which n' is multiplied by;
       the others as for `blend`.
@@ -228,7 +223,7 @@ def confidence(
     if knowledge is not None:
         k = trusted(knowledge, strength)
         votes, total = votes + k[:, None] * unit(knowledge), total + k
-    return (np.linalg.norm(votes, axis=1) / total).clip(0, 1).astype(np.float32)  # type: ignore[no-any-return]
+    return np.asarray((np.linalg.norm(votes, axis=1) / total).clip(0, 1), np.float32)
 
 
 def lengths(rows: np.ndarray) -> np.ndarray:

@@ -1,5 +1,4 @@
-"""The loops over observations, in numba: rows of Gaussian i are starts[i] to starts[i + 1], in
-order of views.
+"""Loops over observations, in numba: Gaussian i has rows starts[i] to starts[i + 1], by views.
 
 A Gaussian is worked off by one thread, in float64 and in this order: the same bits for any number
 of threads.
@@ -28,13 +27,13 @@ def place(ids, weights, sums, view, cursors, views, to_weights, to_means):
 
 
 @serial
-def _direction(means, lengths, factors, first, last, chosen, out):
-    """out = Σ factor · b / |b| over the chosen rows; returns Σ factor."""
+def _direction(means, lengths, factors, first, last, mask, out):
+    """out = Σ factor · b / |b| over the rows of the mask; returns Σ factor."""
     for c in range(len(out)):
         out[c] = 0.0
     total = 0.0
     for row in range(first, last):
-        if chosen[row - first]:
+        if mask[row - first]:
             total += factors[row - first]
             scale = factors[row - first] / lengths[row - first]
             for c in range(len(out)):
@@ -51,16 +50,16 @@ def _length(direction):
 
 
 @serial
-def _average(means, weights, lengths, first, last, chosen, steps, floor, factors, direction, out):
-    """Mean of the chosen rows, after `steps` towards the geometric median of their directions;
-    returns r of the mean.
+def _average(means, weights, lengths, first, last, mask, steps, floor, factors, direction, out):
+    """Mean of the mask's rows, after `steps` to the median of their directions; returns r of the
+    mean.
 
     Every step takes a row's weight over its chord to the direction of the last average, or over
     `floor` if less.
     """
     for row in range(first, last):
         factors[row - first] = weights[row]
-    total = _direction(means, lengths, factors, first, last, chosen, direction)
+    total = _direction(means, lengths, factors, first, last, mask, direction)
     for c in range(len(out)):
         out[c] = np.float32(0)
     if total == 0:
@@ -74,12 +73,12 @@ def _average(means, weights, lengths, first, last, chosen, steps, floor, factors
                 cosine += means[row, c] * direction[c]
             cosine /= lengths[row - first] * size
             factors[row - first] = weights[row] / max(math.sqrt(max(2 - 2 * cosine, 0.0)), floor)
-        total = _direction(means, lengths, factors, first, last, chosen, direction)
+        total = _direction(means, lengths, factors, first, last, mask, direction)
     for c in range(len(out)):
         direction[c] = 0.0
     total = 0.0
     for row in range(first, last):
-        if chosen[row - first]:
+        if mask[row - first]:
             total += factors[row - first]
             for c in range(len(out)):
                 direction[c] += factors[row - first] * means[row, c]
@@ -90,9 +89,7 @@ def _average(means, weights, lengths, first, last, chosen, steps, floor, factors
 
 @kernel
 def averages(starts, views, weights, means, half_of, steps, floor):
-    """Averages f32 [3, N, C] over all views and by each half of them, `half_of` [V] 0 or 1;
-    agreement r f32 [N].
-    """
+    """Averages f32 [3, N, C] over all views and each half, `half_of` [V]; agreement r f32 [N]."""
     n, channels = len(starts) - 1, means.shape[1]
     features, agreement = np.zeros((3, n, channels), np.float32), np.zeros(n, np.float32)
     for part in prange(PARTS):
@@ -100,7 +97,7 @@ def averages(starts, views, weights, means, half_of, steps, floor):
         for i in range(part * n // PARTS, (part + 1) * n // PARTS):
             longest = max(longest, starts[i + 1] - starts[i])
         lengths, factors, direction = np.empty(longest), np.empty(longest), np.empty(channels)
-        chosen = np.empty(longest, np.bool_)
+        mask = np.empty(longest, np.bool_)
         for i in range(part * n // PARTS, (part + 1) * n // PARTS):
             first, last = starts[i], starts[i + 1]
             for row in range(first, last):
@@ -110,9 +107,9 @@ def averages(starts, views, weights, means, half_of, steps, floor):
                 lengths[row - first] = max(math.sqrt(square), 1e-12)
             for half in range(3):
                 for row in range(first, last):
-                    chosen[row - first] = half == 0 or half_of[views[row]] == half - 1
-                r = _average(means, weights, lengths, first, last, chosen, steps, floor, factors, direction,
-                             features[half, i])  # fmt: skip
+                    mask[row - first] = half == 0 or half_of[views[row]] == half - 1
+                r = _average(means, weights, lengths, first, last, mask, steps, floor, factors,
+                             direction, features[half, i])  # fmt: skip
                 if half == 0:
                     agreement[i] = r
     return features, agreement

@@ -1,4 +1,4 @@
-"""What the views say of each Gaussian, and what is made of it without looking at a view again.
+"""Observations of Gaussians by views, and features made of them without another look at a view.
 
 A teacher's map of a view becomes a value for each cell of 4×4 pixels; what is known at points goes
 to Gaussians beside them.
@@ -34,7 +34,7 @@ class Observations:
     views:   i32 [R], number of the view among those that were gathered.
     weights: f32 [R] > 0, pixels: what the Gaussian makes up of the view, counted as its cells
       count.
-    means:   f32 [R, C], the mean of what these cells say.
+    means:   f32 [R, C], the mean of these cells' values.
     """
 
     starts: np.ndarray
@@ -48,8 +48,8 @@ class Estimate:
     """Features f32 [N, C], zero where no view sees a Gaussian, and the evidence for them.
 
     weights:    f32 [N], pixels, over all views.
-    n_views:    i32 [N] views that give a Gaussian at least the weight asked for.
-    agreement:  f32 [N], r = |Σ w b / |b|| / Σ w: 1 if all views say the same, 0 without a view.
+    n_views:    i32 [N] views that give a Gaussian at least `min_weight`.
+    agreement:  f32 [N], r = |Σ w b / |b|| / Σ w: 1 if all views agree, 0 without a view.
     halves:     f32 [2, N, C], features by each half of the views alone; half_views i32 [2, N], as
       n_views.
     """
@@ -63,24 +63,24 @@ class Estimate:
 
 
 def gathered(n: int, n_channels: int, views: Iterable[Lifted]) -> Observations:
-    """Sort what views say by Gaussian. Choices: float32, about 4 C bytes an observation; nothing is
-    rendered twice.
-    """
+    """Views' observations by Gaussian. Choices: float32, 4 C bytes each; one rendering a view."""
     lifted = list(views)
     counts = np.zeros(n, np.int64)
     for view in lifted:
         counts[view.ids] += 1
     starts = np.concatenate([[0], counts.cumsum()])
     size, cursors = int(starts[-1]), starts[:-1].copy()
-    found = Observations(
+    observations = Observations(
         starts,
         np.empty(size, np.int32),
         np.empty(size, np.float32),
         np.empty((size, n_channels), np.float32),
     )
     for number, view in enumerate(lifted):
-        kernels.place(*view, number, cursors, found.views, found.weights, found.means)
-    return found
+        kernels.place(
+            *view, number, cursors, observations.views, observations.weights, observations.means
+        )
+    return observations
 
 
 def estimate(
@@ -90,14 +90,13 @@ def estimate(
 
     Args:
       median_steps: of Weiszfeld's, from the weighted mean towards the geometric median of the
-        views' directions
-                    b / |b|; 0: the mean.
+        views' directions b / |b|; 0: the mean.
       min_weight:   pixels; a view of less is not counted in n_views.
     Choices: the result is Σ f b / Σ f with f > 0, so that it never leaves the cone of what views
       said, as the exact least-squares solution does. Chords below NEAREST count as NEAREST: no
       single view takes all.
     """
-    starts, seen = observations.starts, observations.weights >= min_weight
+    starts, enough = observations.starts, observations.weights >= min_weight
     half_of = halves_of(int(observations.views.max(initial=-1)) + 1)
     features, agreement = kernels.averages(
         *vars(observations).values(), half_of, median_steps, NEAREST
@@ -106,7 +105,7 @@ def estimate(
     n = len(starts) - 1
     half_views = np.stack(
         [
-            np.bincount(owner[seen & (half_of[observations.views] == half)], minlength=n)
+            np.bincount(owner[enough & (half_of[observations.views] == half)], minlength=n)
             for half in (0, 1)
         ]
     ).astype(np.int32)
@@ -117,7 +116,7 @@ def estimate(
 
 
 def halves_of(n_views: int) -> np.ndarray:
-    """Which half each view is of, i8 [V].
+    """Half, 0 or 1, that each view belongs to, i8 [V].
 
     Choices: N_BLOCKS blocks of successive views, by turns: neighbours on a path see alike and err
       alike, so that halves of every other view would agree on what is wrong.
@@ -133,12 +132,10 @@ def carry(
     normals: np.ndarray,
     unit: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What is known at points, for Gaussians: the mean of the N_POINTS nearest, by distance and
-    normal.
+    """Values of points carried to Gaussians: mean of the N_POINTS nearest, by distance and normal.
 
     Args: values [P, C] at points [P, 3], scene units, with point_normals [P, 3]; means [N, 3] with
-      normals [N, 3]; all
-          normals unit, of any sign; unit: scene units of a metre, > 0.
+      normals [N, 3]; all normals unit, of any sign; unit: scene units of a metre, > 0.
     Returns: f32 [N, C], and the distance to the nearest point in scene units, f32 [N], for who
       trusts near points only.
     Raises:  ValueError without points.
@@ -172,31 +169,31 @@ def overlaps(n_entries: int, n_pixels: int) -> np.ndarray:
 def to_cells(
     features: np.ndarray, counts: np.ndarray, size: tuple[int, int], mask: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What each cell of a view says, and what it counts.
+    """Value of each cell of a view, and its weight.
 
     Args:
-      features: [h, w, C] of the teacher; an entry that is zero in all channels, or not finite, says
-        nothing.
+      features: [h, w, C] of the teacher; an entry that is zero in all channels, or not finite,
+        does not count.
       counts:   [h, w] >= 0, what an entry counts.
       size:     width and height of the view, pixels; mask [H, W] true where a pixel counts, or
         None.
-    Returns: values f32 [⌈H/4⌉, ⌈W/4⌉, C], counts f32 [⌈H/4⌉, ⌈W/4⌉], 0 where nothing is said.
+    Returns: values f32 [⌈H/4⌉, ⌈W/4⌉, C], counts f32 [⌈H/4⌉, ⌈W/4⌉], 0 where nothing counts.
     Choices: a cell is the mean of the entries that it lies in, by the area that each covers of it:
       exact on a grid of cells, an average of a finer one, a copy of a coarser one. A cell counts if
       all its pixels do, as the reduced pixels that a training looks at.
     """
-    said = features.astype(np.float32)
-    usable = np.isfinite(said).all(-1) & said.any(-1)
+    values = features.astype(np.float32)
+    usable = np.isfinite(values).all(-1) & values.any(-1)
     share = np.where(usable, counts, 0).astype(np.float32)
-    said[~usable] = 0
+    values[~usable] = 0
     width, height = size
     shape = (-(-height // CELL), -(-width // CELL))
     if share.shape != shape or height % CELL or width % CELL:
         down, across = overlaps(share.shape[0], height), overlaps(share.shape[1], width)
-        sums = np.einsum("yh,hwc,xw->yxc", down, said * share[..., None], across, optimize=True)
+        sums = np.einsum("yh,hwc,xw->yxc", down, values * share[..., None], across, optimize=True)
         share = (down @ share @ across.T).astype(np.float32)
-        said = (sums / np.where(share > 0, share, 1)[..., None]).astype(np.float32)
+        values = (sums / np.where(share > 0, share, 1)[..., None]).astype(np.float32)
     if mask is not None:
         padded = np.pad(mask, ((0, -height % CELL), (0, -width % CELL)), constant_values=True)
         share = share * padded.reshape(shape[0], CELL, shape[1], CELL).all((1, 3))
-    return said, share
+    return values, share

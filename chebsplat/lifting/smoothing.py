@@ -18,30 +18,25 @@ DISTANCE, PLANE = 0.15, 0.03
 # the same of a colour's difference, of [0, 1] a channel, and of the normals' angle, rad
 COLOR, ANGLE = 0.1, 0.5
 HALF_EXTENT = 2.7  # metres from the middle that half of a furnished room's Gaussians lie within
-# Gaussians, evenly of all, of which the distance to the 8th nearest tells the room from what lies
-# far behind it: there it is more than APART times what it is for the quarter that lies closest.
+# Gaussians, evenly of all, whose distance to the 8th nearest separates the room from what lies far
+# behind it: there it is more than APART times what it is for the quarter that lies closest.
 SAMPLED, NTH, APART = 20_000, 8, 10.0
 ROWS = 4096  # Gaussians that are worked off at once
 
 
 class Affinities(NamedTuple):
-    """neighbors i32 [N, K] of each Gaussian, itself not among them; weights f32 [N, K] in [0, 1],
-    0: none.
-    """
+    """neighbors i32 [N, K] of each Gaussian, without it; weights f32 [N, K] in [0, 1], 0: none."""
 
     neighbors: np.ndarray
     weights: np.ndarray
 
 
 def room_unit(means: np.ndarray) -> float:
-    """Scene units of a metre if the Gaussians, centres [N, 3], fill a room; for scenes of unknown
-    scale.
+    """Scene units of a metre if Gaussians at [N, 3] fill a room; for scenes of unknown scale.
 
     Choices: the median distance from the middle is taken for HALF_EXTENT, of those that lie as
-      close together as a room
-      is filled: a background far away does not count, be it most of them. 1 where all Gaussians
-        coincide. In generated
-      rooms of 3.4 to 7 m it lies between 0.8 and 1.3.
+      close together as a room is filled: a background far away does not count, be it most of them.
+      1 where all Gaussians coincide. In generated rooms of 3.4 to 7 m it lies between 0.8 and 1.3.
     """
     some = means[:: max(-(-len(means) // SAMPLED), 1)]
     spacing = (
@@ -59,7 +54,7 @@ def room_unit(means: np.ndarray) -> float:
 def affinities(
     means: np.ndarray, normals: np.ndarray, colors: np.ndarray, unit: float = 1.0
 ) -> Affinities:
-    """How much each Gaussian's neighbours are like it.
+    """Nearest neighbours of each Gaussian, weighted by likeness.
 
     Args: means [N, 3] scene units; normals [N, 3] unit, of any sign; colors [N, 3] in [0, 1]; unit
       > 0.
@@ -86,12 +81,12 @@ def affinities(
     if index.size == 0:
         return Affinities(index, weights)
     where = (means.astype(np.float64) - means.mean(0)) / unit
-    _, found = cKDTree(where).query(
+    _, neighbors = cKDTree(where).query(
         where, index.shape[1] + 1, distance_upper_bound=REACH, workers=-1
     )
     for start in range(0, n, ROWS):
         rows = np.arange(start, min(start + ROWS, n))
-        nearest = _without_self(found[rows], rows)
+        nearest = _without_self(neighbors[rows], rows)
         there = nearest < n
         nearest = np.where(there, nearest, rows[:, None])
         offsets = where[nearest] - where[rows, None]
@@ -107,13 +102,11 @@ def affinities(
     return Affinities(index, weights)
 
 
-def _without_self(found: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Neighbours [n, K] of [n, K + 1] found: each row's own number goes, or the farthest where it
-    is not among them.
-    """
-    own = found == rows[:, None]
+def _without_self(neighbors: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Neighbours [n, K] of [n, K + 1], less each row's own number, or the farthest without it."""
+    own = neighbors == rows[:, None]
     own[:, -1] |= ~own.any(1)
-    others: np.ndarray = found[~own].reshape(len(found), -1)
+    others: np.ndarray = neighbors[~own].reshape(len(neighbors), -1)
     return others
 
 

@@ -1,5 +1,4 @@
-"""Points on the surface that views show, for scenes without measured depth: depth of many views,
-fused.
+"""Points on the surface that views show, for scenes without measured depth: fused depth of views.
 
 It is rendered from Gaussians, whose own centres lie off the surface that descriptors are of, or
 swept from photos.
@@ -29,13 +28,14 @@ LEAST = 0.4
 EDGE_SWEPT, LEAST_SWEPT = 0.08, 0.2
 # directions, Gaussians that try them; cosine of 11 degrees
 N_TRIED, N_PLANES, PARALLEL = 400, 20_000, 0.98
+SQUARE = 0.2  # cosine, of directions at right angles
+FREE, SEATS = 0.1, 0.23  # of a room's extent: off its walls; off floor and ceiling
+LEVEL = 0.95  # cosine of a level surface's normal to up
 LOOKOUT_SIZE, LOOKOUT_ANGLE = (192, 144), 1.4  # pixels; rad, across
 
 
 class Surface(NamedTuple):
-    """M points: means f64 [M, 3] scene units; eyes f64 [M, 3], the mean of the cameras that saw
-    them.
-    """
+    """M points: means f64 [M, 3] scene units; eyes f64 [M, 3], the mean of their cameras."""
 
     means: np.ndarray
     eyes: np.ndarray
@@ -52,15 +52,14 @@ def surface(
     """Points of the surface, at most one in a cube of edge EDGE.
 
     Args: parameters: raw, of N Gaussians; cam_from_world [V, 4, 4] and Ks [V, 3, 3] of views of
-      `size` (width, height);
-          unit: scene units of a metre; n_pixels: that are looked at, of all views alike, drawn.
+      `size` (width, height); unit: scene units of a metre; n_pixels: that are looked at, of all
+      views alike, drawn.
     Choices: depth as `render_depth` has it; points averaged by cube. How many pixels a cube needs
-      follows from how many
-      others hold: in a wide room, or of few pixels, all hold fewer.
+      follows from how many others hold: in a wide room, or of few pixels, all hold fewer.
     """
     renderer, (width, height) = SceneRenderer(dict(parameters)), size
     rng, count = np.random.default_rng(0), min(max(n_pixels // max(len(Ks), 1), 1), width * height)
-    seen, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    points, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for pose, K in zip(cam_from_world, Ks, strict=True):
         view = View(torch.from_numpy(K).float(), torch.from_numpy(pose).float(), width, height)
         depth, covered = (image.ravel() for image in renderer.render_depth(view, NEAREST * unit))
@@ -70,9 +69,9 @@ def surface(
             np.stack([pixels % width + 0.5, pixels // width + 0.5, np.ones(len(pixels))], 1)
             @ np.linalg.inv(K).T
         )
-        seen.append((rays * depth[pixels, None] - pose[:3, 3]) @ pose[:3, :3])
+        points.append((rays * depth[pixels, None] - pose[:3, 3]) @ pose[:3, :3])
         eyes.append(np.tile(-pose[:3, :3].T @ pose[:3, 3], (len(pixels), 1)))
-    return fused(np.concatenate(seen), np.concatenate(eyes), EDGE * unit)
+    return fused(np.concatenate(points), np.concatenate(eyes), EDGE * unit)
 
 
 def swept_surface(
@@ -82,20 +81,19 @@ def swept_surface(
 
     Args: Ks [V, 3, 3] in its pixels; cam_from_world [V, 4, 4]; unit: scene units of a metre.
     """
-    seen, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    points, eyes = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for depth, K, pose, eye in zip(
         depths, Ks, cam_from_world, centers(cam_from_world), strict=True
     ):
-        seen.append(unproject(depth, K, pose, np.argwhere(depth > 0)))
-        eyes.append(np.tile(eye, (len(seen[-1]), 1)))
-    return fused(np.concatenate(seen), np.concatenate(eyes), EDGE_SWEPT * unit, LEAST_SWEPT)
+        points.append(unproject(depth, K, pose, np.argwhere(depth > 0)))
+        eyes.append(np.tile(eye, (len(points[-1]), 1)))
+    return fused(np.concatenate(points), np.concatenate(eyes), EDGE_SWEPT * unit, LEAST_SWEPT)
 
 
 def lookouts(
     means: np.ndarray, opacities: np.ndarray, up: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Views [V, 4, 4] from within a room, and their K [V, 3, 3], for a splat without cameras; of
-    LOOKOUT_SIZE.
+    """Views [V, 4, 4] of LOOKOUT_SIZE within a room, and their K, for a splat without cameras.
 
     Args: means [N, 3] scene units, opacities [N] in (0, 1); up [3] unit.
     Choices: nine places about the middle of what is opaque, at half its height, looking six ways,
@@ -122,38 +120,55 @@ def lookouts(
     return np.stack(poses), np.tile(K, (len(poses), 1, 1))
 
 
-def floor_up(means: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Up, unit [3], of Gaussians without cameras: across the planes that hold most of them, away
-    from the fuller end.
+def room_up(
+    means: np.ndarray, normals: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, float, float]:
+    """Up, unit [3], of the Gaussians of a room without cameras, and two signs that it is a room.
 
-    Args: means [N, 3]; normals [N, 3] unit, of any sign; weights [N], how much of a flat surface
-      each stands for.
-    Choices: a floor and what is parallel to it (ceiling, tables) are more than the walls of one
-      direction; things stand on a floor, so that the middle of all lies nearer to it. Directions
-      are tried at the normals of N_TRIED Gaussians.
+    Args: means [N, 3]; normals [N, 3] unit, of any sign; weights [N], of the flat surface that each
+      stands for.
+    Returns: up; the share of the surface that lies across three directions at right angles; the
+      lean: in [0, 1], 0 where nothing tells up from down.
+    Choices: a room's directions are those that most of its surface lies across; along up, what
+      stands free of floor, ceiling and walls lies low, and so do level surfaces between floor and
+      ceiling (SEATS), without lamps and beams. Directions are tried at the normals of N_TRIED
+      Gaussians.
     """
     rng = np.random.default_rng(0)
     share = weights / weights.sum()
-    rows = rng.choice(len(means), N_TRIED, p=share)
-    within = (
-        np.abs(
-            normals[rows] @ normals[rng.choice(len(means), min(len(means), N_PLANES), p=share)].T
-        )
-        > PARALLEL
-    )
-    up: np.ndarray = normals[rows[within.sum(1).argmax()]].astype(np.float64)
-    for _ in range(3):  # the mean of what is parallel to it, of either sign
-        here = np.abs(normals @ up) > PARALLEL
-        up = np.linalg.eigh((normals[here] * weights[here, None]).T @ normals[here])[1][:, -1]
-    heights = means @ up
-    low, high = np.quantile(heights, (0.02, 0.98))
-    return up if (heights.clip(low, high) * share).sum() <= (low + high) / 2 else -up
+    tried = normals[rng.choice(len(means), N_TRIED, p=share)]
+    drawn = normals[rng.choice(len(means), min(len(means), N_PLANES), p=share)]
+    across = (np.abs(tried @ drawn.T) > PARALLEL).mean(1)
+    axes, shares, heights = [], [], []
+    for _ in range(3):
+        best = int(across.argmax())
+        shares.append(float(across[best]))
+        axis: np.ndarray = tried[best].astype(np.float64)
+        across[np.abs(tried @ tried[best]) > SQUARE] = 0
+        for _ in range(3):  # the mean of what is parallel to it, of either sign
+            here = np.abs(normals @ axis) > PARALLEL
+            axis = np.linalg.eigh((normals[here] * weights[here, None]).T @ normals[here])[1][:, -1]
+        low, high = np.quantile(means @ axis, (0.02, 0.98))
+        heights.append((means @ axis - low) / max(high - low, 1e-30))
+        axes.append(axis)
+
+    free = np.all([(h > FREE) & (h < 1 - FREE) for h in heights], 0)
+    leans = [lean(share, h, free) for h in heights]
+    best = int(np.argmax([s * (1 + 2 * of**2) for s, of in zip(shares, leans, strict=True)]))
+    up, height = axes[best], heights[best]
+    level = (np.abs(normals @ up) > LEVEL) & (height > SEATS) & (height < 1 - SEATS)
+    down = (leans[best] + lean(share, height, level)) / 2
+    return (up if down >= 0 else -up), sum(shares), abs(down)
+
+
+def lean(share: np.ndarray, height: np.ndarray, mask: np.ndarray) -> float:
+    """Share [N] of what is in the mask that lies in the lower half, less that in the upper one."""
+    total = float(share[mask].sum())
+    return (2 * float(share[mask & (height < 0.5)].sum()) - total) / max(total, 1e-30)
 
 
 def fused(points: np.ndarray, eyes: np.ndarray, edge: float, least: float = LEAST) -> Surface:
-    """The mean of the points in each cube of this edge, and of their eyes, where it holds enough of
-    them (`least`).
-    """
+    """Mean of the points, and of their eyes, in each cube of this edge that has enough of them."""
     if len(points) == 0:
         return Surface(points, eyes)
     cube = np.unique(cubes_of(points, edge), return_inverse=True)[1]

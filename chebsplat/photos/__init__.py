@@ -1,5 +1,4 @@
-"""Photos as they come from a camera: how sharp they are, which frames of a video to take, the depth
-that they tell, the exposures that they were taken with.
+"""Photos from a camera: their sharpness, the frames to take of a video, depth, and exposures.
 
 Depth is of reduced images, cameras in their pixels. May import cameras and kernels.
 """

@@ -6,16 +6,15 @@ import numpy as np
 
 
 def tell_of(colors: np.ndarray, pixels: np.ndarray) -> bool:
-    """Do colours u8 [N, 3] of points tell more of the pixels u8 [N, 3] that show them than one
-    colour for all would?
+    """True where colours u8 [N, 3] of points are nearer to the pixels u8 [N, 3] that show them than
+    one colour for all is.
 
     Choices: by mean distance, with the pixels' median for the one colour: what is all black, all of
       one colour, drawn at random or written in other units tells nothing, and needs no list of such
-      cases. Of no points, or of pixels
-      that are all alike, nothing can be told: yes.
+      cases. Of no points, or of pixels that are all alike, nothing can be decided: True.
     """
     if not len(pixels):
         return True
-    wanted = pixels.astype(np.float64)
-    by_one = np.abs(wanted - np.median(wanted, 0)).mean()
-    return bool(by_one == 0 or np.abs(wanted - colors).mean() < by_one)
+    target = pixels.astype(np.float64)
+    by_one = np.abs(target - np.median(target, 0)).mean()
+    return bool(by_one == 0 or np.abs(target - colors).mean() < by_one)

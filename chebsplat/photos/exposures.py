@@ -1,8 +1,6 @@
-"""The exposure and white balance that photos were taken with, measured where several of them show
-the same points.
+"""Exposure and white balance of photos, measured where several of them show the same points.
 
-Exposures are f64 [V, 3]: stops (logarithms to base 2) of linear light by channel, of the mean view
-  0.
+Exposures are f64 [V, 3]: stops (log2 of linear light) by channel, relative to the mean view.
 """
 
 from __future__ import annotations
@@ -14,9 +12,12 @@ import numpy as np
 from chebsplat.cameras import centers
 
 CELL = 8  # pixels: colours of a point are means over squares of this side
-MOST_POINTS, LEAST_POINTS = 4000, 30  # points without tracks, and of a view whose exposure is told
+MOST_POINTS, LEAST_POINTS = (
+    4000,
+    30,
+)  # points without tracks, and of a view whose exposure is measured
 MOST = 300_000  # sightings of points that are looked at, or about as many
-# linear light beyond which a sensor's curve or its end tells instead of the exposure
+# linear light beyond which a sensor is not linear, or saturated
 DARK, BRIGHT = 0.005, 0.85
 # of medians by point and by view, in turns: more for what drifts along a path, which stays
 ROUNDS, SETTLED = 30, 1e-4
@@ -34,9 +35,7 @@ def light_of(values: np.ndarray) -> np.ndarray:
 
 
 def relit(image: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """An image u8 [H, W, 3] as it would be with so many more stops [3]; what is too bright is cut
-    off.
-    """
+    """An image u8 [H, W, 3] after so many more stops [3]; what becomes too bright is cut off."""
     lit = np.minimum(light_of(np.arange(256) / 255)[:, None] * 2.0 ** np.asarray(stops), 1)
     tables = np.where(lit <= 0.0031308, 12.92 * lit, 1.055 * lit ** (1 / 2.4) - 0.055)
     tables = (255 * tables).round().astype(np.uint8)
@@ -53,44 +52,45 @@ def measured_exposures(
     """Exposures [V, 3] of V photos of the same points; NaN of those that show too few of them.
 
     Args: images: u8 [H, W, 3] of V views; Ks [V, 3, 3] pixels; cam_from_world [V, 4, 4]; points [N,
-      3]; tracks: int
-      [T, 2] (point, view), or None: points are seen by all views that have them within their frame.
+      3]; tracks: int [T, 2] (point, view), or None: points are seen by all views that have them
+      within their frame.
     Choices: light is that of a point times its view's exposure. Both are medians, by turns, so that
-      walls in between
-      and highlights count little. Of many points, some: with tracks as many as are seen MOST times
-        in all.
+      walls in between and highlights count little. Of many points, some: with tracks as many as are
+      seen MOST times in all.
     """
     n_views = len(Ks)
-    wanted = (
+    n_points = (
         min(MOST_POINTS, 4 * MOST // n_views)
         if tracks is None
         else len(points) * MOST // max(len(tracks), 1)
     )
-    kept = np.linspace(0, len(points) - 1, min(len(points), max(wanted, 1))).astype(int)
+    sample = np.linspace(0, len(points) - 1, min(len(points), max(n_points, 1))).astype(int)
     if tracks is None:
-        seen = [kept] * n_views
+        visible = [sample] * n_views
     else:
-        tracks = tracks[np.isin(tracks[:, 0], kept)]
+        tracks = tracks[np.isin(tracks[:, 0], sample)]
         tracks = tracks[np.argsort(tracks[:, 1], kind="stable")]
-        seen = np.split(tracks[:, 0], np.searchsorted(tracks[:, 1], np.arange(1, n_views)))
-    found = [
+        visible = np.split(tracks[:, 0], np.searchsorted(tracks[:, 1], np.arange(1, n_views)))
+    measured = [
         _light_at(*view)
-        for view in zip(images, Ks, cam_from_world, (points[some] for some in seen), strict=True)
+        for view in zip(images, Ks, cam_from_world, (points[some] for some in visible), strict=True)
     ]
-    light = np.concatenate([values for values, _ in found])
-    point = np.concatenate([some[there] for some, (_, there) in zip(seen, found, strict=True)])
-    view = np.repeat(np.arange(n_views), [len(values) for values, _ in found])
+    light = np.concatenate([values for values, _ in measured])
+    point = np.concatenate(
+        [some[there] for some, (_, there) in zip(visible, measured, strict=True)]
+    )
+    view = np.repeat(np.arange(n_views), [len(values) for values, _ in measured])
     shared = np.bincount(point, minlength=len(points))[point] >= 2
     light, point, view = light[shared], point[shared], view[shared]
     exposures = np.full((n_views, 3), np.nan)
     enough = np.bincount(view, minlength=n_views) >= LEAST_POINTS
     if enough.sum() < 2:
         return exposures
-    told = enough[view]
+    usable = enough[view]
     light, view, point = (
-        np.log2(light[told]),
-        view[told],
-        np.unique(point[told], return_inverse=True)[1],
+        np.log2(light[usable]),
+        view[usable],
+        np.unique(point[usable], return_inverse=True)[1],
     )
     of_views = np.zeros((n_views, 3))
     for _ in range(ROUNDS):
@@ -106,9 +106,7 @@ def measured_exposures(
 def _light_at(
     image: np.ndarray, K: np.ndarray, pose: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean linear light [M, 3] about points [P, 3] in an image, and which of them [P] it tells
-    of.
-    """
+    """Mean linear light [M, 3] about points [P, 3] in an image; mask [P] of those measured."""
     height, width = image.shape[:2]
     half = min(CELL, height, width) // 2
     camera = points @ pose[:3, :3].T + pose[:3, 3]
@@ -139,8 +137,7 @@ def _medians(values: np.ndarray, group: np.ndarray, n_groups: int = 0) -> np.nda
 
 
 def own_part(exposures: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
-    """What of exposures [V, 3] is a photo's own, and not shared by the views about it; 0 where they
-    are NaN.
+    """Part of exposures [V, 3] that is a photo's own, not shared by views about it; 0 where NaN.
 
     Choices: what changes smoothly with where a camera stands and looks is left in the photos: views
       between them, test views too, have it, and a scene can show it. Exposures are a Gaussian
@@ -149,9 +146,9 @@ def own_part(exposures: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
       likelihood, by brightness and by hue.
     """
     own = np.zeros_like(exposures)
-    known = np.flatnonzero(np.isfinite(exposures).all(1))
-    every = -(-len(known) // MOST_VIEWS)
-    for some in (known[start::every] for start in range(every)):
+    finite = np.flatnonzero(np.isfinite(exposures).all(1))
+    every = -(-len(finite) // MOST_VIEWS)
+    for some in (finite[start::every] for start in range(every)):
         if len(some) >= 3:
             own[some] = _own_part(exposures[some], cam_from_world[some])
     return own

@@ -1,6 +1,4 @@
-"""Frames of a video for reconstruction: how far the picture moves between them, which are
-blurred, and which to take.
-"""
+"""Frames of a video for reconstruction: motion of the picture, blur, and the choice of frames."""
 
 from __future__ import annotations
 
@@ -17,7 +15,7 @@ SOFT = 0.6  # of the median ratio of fine to coarse detail
 
 
 def shifts(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """How far each block of a picture has moved, by phase correlation (Kuglin and Hines 1975).
+    """Motion of each block of a picture, by phase correlation (Kuglin and Hines 1975).
 
     Args: before, after: grey [H, W], H and W at least BLOCK.
     Returns: [B, 2] (x, y) in pixels, whole ones.
@@ -46,8 +44,8 @@ def shifts(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 def progress(moves: np.ndarray, step: float = STEP) -> np.ndarray:
-    """How often the picture has moved by `step` up to each frame, [F], in whole and begun steps,
-    never falling.
+    """Steps of `step` that the picture has moved up to each frame, f64 [F], begun ones in part;
+    ascending.
 
     Args: moves: [F, B, 2] of each block from the frame before, in units of the picture's width;
       moves[0] is 0.
@@ -75,14 +73,14 @@ def choose(steps: np.ndarray, sharpness: np.ndarray, at_most: int) -> np.ndarray
     """
     n_steps = max(int(steps[-1] + 0.5), 1)
     edges = np.linspace(0, n_steps, min(n_steps, at_most) + 1)
-    taken = []
+    frames = []
     for low, high in itertools.pairwise(edges):
         inside = (steps >= low) & (steps < high)
         middle = inside & (steps >= 0.75 * low + 0.25 * high) & (steps <= 0.25 * low + 0.75 * high)
         rows = np.flatnonzero(middle if middle.any() else inside)
         if len(rows):
-            taken.append(rows[np.argmax(sharpness[rows])])
-    return np.array(taken, int)
+            frames.append(rows[np.argmax(sharpness[rows])])
+    return np.array(frames, int)
 
 
 def laplacian_variance(grey: np.ndarray) -> float:
@@ -109,7 +107,7 @@ def detail(grey: np.ndarray) -> tuple[float, float]:
 
 
 def blurred(details: np.ndarray) -> np.ndarray:
-    """Which views are far less sharp than their capture's median, bool [V], of `detail` [V, 2].
+    """True for views far less sharp than their capture's median, bool [V], of `detail` [V, 2].
 
     Choices: two signs must agree. A plain wall has little detail at either scale, and a carpet more
       at the fine one; blur takes the fine detail and leaves the coarse. Both are ratios to the

@@ -1,6 +1,4 @@
-"""Epipolar lines of known poses: matches looked for along them alone, and how far free matches miss
-them.
-"""
+"""Epipolar lines of known poses: matches along them, and distances of free matches to them."""
 
 from __future__ import annotations
 
@@ -11,7 +9,7 @@ import numpy as np
 from chebsplat.kernels.jit import body, kernel, prange
 
 BAND = 1.5  # pixels that a match may miss by, as Sampson measures it
-# pixels: features are kept by strips of columns, and within a strip by rows of as many
+# pixels: features are stored by strips of columns, and within a strip by rows of as many
 STRIP = 16.0
 RATIO = 0.7  # Lowe's, of the distances of the nearest and the second nearest descriptor by the line
 ALIKE = 0.9  # least cosine of two descriptors
@@ -23,50 +21,45 @@ def along_lines(
     pairs: np.ndarray,
     F: np.ndarray,
 ) -> list[np.ndarray]:
-    """Matches i64 [M, 2] of each pair: features of its first, in their order, and of its second
-    view.
+    """Matches i64 [M, 2] of each pair: features of its first view, in order, and of its second.
 
     Args:    pixels: of each view f32 [n, 2]; descriptors: uint8 [n, D]; pairs i64 [P, 2]; F f64 [P,
       3, 3]: of each.
     Choices: mutual nearest descriptors within BAND, by Lowe's ratio among those that lie there: the
       line leaves a hundredth of the features, so this is faster than a search of all of them, and
-      finds what repeats elsewhere, too.
-      Chance finds a match among so few more easily: RATIO and ALIKE are stricter than usual, and
-        leave a tenth of such
-      (of fox's matches, with lines moved by 12 pixels across). Where F is 0, as for two views from
-      one place, no feature has a line.
+      finds what repeats elsewhere, too. Chance finds a match among so few more easily: RATIO and
+      ALIKE are stricter than usual, and leave a tenth of such (of fox's matches, with lines moved
+      by 12 pixels across). Where F is 0, as for two views from one place, no feature has a line.
     """
-    kept = [_by_strips(at) for at in pixels]
+    strips = [_by_strips(at) for at in pixels]
     start = np.cumsum([0, *map(len, pixels)])
     partner = _along_lines(
-        np.concatenate([at[order] for at, (order, _, _) in zip(pixels, kept, strict=True)]).astype(
-            np.float32
-        ),
         np.concatenate(
-            [some[order] for some, (order, _, _) in zip(descriptors, kept, strict=True)]
+            [at[order] for at, (order, _, _) in zip(pixels, strips, strict=True)]
+        ).astype(np.float32),
+        np.concatenate(
+            [some[order] for some, (order, _, _) in zip(descriptors, strips, strict=True)]
         ),
         start,
-        np.concatenate([first for _, first, _ in kept]),
-        np.cumsum([0, *(len(first) for _, first, _ in kept)]),
-        np.array([rows for _, _, rows in kept]),
+        np.concatenate([first for _, first, _ in strips]),
+        np.cumsum([0, *(len(first) for _, first, _ in strips)]),
+        np.array([rows for _, _, rows in strips]),
         np.asarray(pairs, np.int64),
         np.asarray(F, np.float64),
         BAND,
         RATIO,
         ALIKE,
     )
-    found = []
+    by_pair = []
     for (a, b), row in zip(pairs, partner, strict=True):
         first = np.flatnonzero(row >= 0)
-        matches = np.stack([kept[a][0][first], kept[b][0][row[first]]], 1)
-        found.append(matches[np.argsort(matches[:, 0])])
-    return found
+        matches = np.stack([strips[a][0][first], strips[b][0][row[first]]], 1)
+        by_pair.append(matches[np.argsort(matches[:, 0])])
+    return by_pair
 
 
 def _by_strips(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """The order of a view's features by cells, the first one of each cell [C + 1], and how many
-    cells a strip has.
-    """
+    """Order of a view's features by cells, first of each cell [C + 1], cells in a strip."""
     place = np.floor(np.maximum(pixels, 0) / STRIP).astype(np.int64).reshape(-1, 2)
     strips, rows = place.max(0, initial=0) + 1
     cell = place[:, 0] * rows + place[:, 1]
@@ -86,8 +79,10 @@ def _along_lines(pixels, descriptors, start, first, cells, rows, pairs, F, band,
     for pair in prange(len(pairs)):
         a, b = pairs[pair]
         _match(
-            pixels[start[a] : start[a + 1]], descriptors[start[a] : start[a + 1]], length[start[a] : start[a + 1]],
-            pixels[start[b] : start[b + 1]], descriptors[start[b] : start[b + 1]], length[start[b] : start[b + 1]],
+            pixels[start[a] : start[a + 1]], descriptors[start[a] : start[a + 1]],
+            length[start[a] : start[a + 1]],
+            pixels[start[b] : start[b + 1]], descriptors[start[b] : start[b + 1]],
+            length[start[b] : start[b + 1]],
             first[cells[b] : cells[b + 1]], rows[b], F[pair], band, ratio, alike, partner[pair],
         )  # fmt: skip
     return partner
@@ -112,7 +107,7 @@ def _match(
     """`partner` [N]: of each feature the other view's that is its match, -1: none."""
     partner[:] = -1
     strips = (len(first) - 1) // rows
-    chosen, closest = np.full(len(others), -1, np.int32), np.full(len(others), -1, np.float32)
+    candidate, closest = np.full(len(others), -1, np.int32), np.full(len(others), -1, np.float32)
     for k in range(len(pixels)):
         x, y = np.float64(pixels[k, 0]), np.float64(pixels[k, 1])
         u, v = F[0, 0] * x + F[0, 1] * y + F[0, 2], F[1, 0] * x + F[1, 1] * y + F[1, 2]
@@ -121,7 +116,7 @@ def _match(
             continue
         down = v if abs(v) > 1e-9 * size else 1e-9 * size  # of an upright line, which no row limits
         reach = 2 * band * size / abs(down)
-        best, second, found = np.float32(-1), np.float32(-1), -1
+        best, second, nearest = np.float32(-1), np.float32(-1), -1
         for strip in range(strips):
             left, right = -(u * strip * STRIP + w) / down, -(u * (strip + 1) * STRIP + w) / down
             top = (min(left, right) - reach) / STRIP
@@ -140,15 +135,15 @@ def _match(
                     continue
                 cosine = _product(descriptors[k], theirs[other]) / (length[k] * their_length[other])
                 if cosine > closest[other]:
-                    closest[other], chosen[other] = cosine, k
+                    closest[other], candidate[other] = cosine, k
                 if cosine > best:
-                    second, best, found = best, cosine, other
+                    second, best, nearest = best, cosine, other
                 elif cosine > second:
                     second = cosine
         if best > alike and 1 - best < ratio * ratio * (1 - second):
-            partner[k] = found
+            partner[k] = nearest
     for k in range(len(pixels)):
-        if partner[k] >= 0 and chosen[partner[k]] != k:
+        if partner[k] >= 0 and candidate[partner[k]] != k:
             partner[k] = -1
 
 
@@ -163,9 +158,7 @@ def _product(one, other):
 def fundamental(
     K: np.ndarray, pose: np.ndarray, K_other: np.ndarray, pose_other: np.ndarray
 ) -> np.ndarray:
-    """F [3, 3] of two views with intrinsics [3, 3] and cam_from_world [4, 4]: x'ᵀ F x = 0 for
-    pixels of one point.
-    """
+    """F [3, 3] of two views, K [3, 3] and cam_from_world [4, 4]: x'ᵀ F x = 0 of one point."""
     between = pose_other @ np.linalg.inv(pose)
     x, y, z = between[:3, 3]
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ between[:3, :3]

@@ -1,5 +1,5 @@
-"""Depth of what has no texture: patches of one colour go on as planes through what is known of
-them.
+"""Depth of what has no texture: patches of one colour continued as planes through their known
+depth.
 
 Of one photo, reduced. The 1 / z of a plane is linear in its pixels, whatever its slant.
 """
@@ -31,18 +31,21 @@ def completed(depth: np.ndarray, colors: np.ndarray) -> np.ndarray:
       the plane whose own pixels are nearest in the photo.
     """
     result, label = depth.astype(np.float32).copy(), patches(colors)
-    known = depth > 0
-    sizes, told = np.bincount(label.ravel()), np.bincount(label[known], minlength=label.max() + 1)
+    has_depth = depth > 0
+    sizes, counts = (
+        np.bincount(label.ravel()),
+        np.bincount(label[has_depth], minlength=label.max() + 1),
+    )
     for patch in np.flatnonzero(
-        (sizes >= SMALLEST) & (told >= np.maximum(KNOWN, SHARE * sizes)) & (told < sizes)
+        (sizes >= SMALLEST) & (counts >= np.maximum(KNOWN, SHARE * sizes)) & (counts < sizes)
     ):
         inside = label == patch
-        pixels, missing = np.argwhere(inside & known), np.argwhere(inside & ~known)
-        found = planes(pixels, 1 / depth[inside & known])
-        if not found:
+        pixels, missing = np.argwhere(inside & has_depth), np.argwhere(inside & ~has_depth)
+        fits = planes(pixels, 1 / depth[inside & has_depth])
+        if not fits:
             continue
-        apart = np.stack([cKDTree(pixels[own]).query(missing)[0] for _, own in found])
-        values = np.stack([_design(missing) @ plane for plane, _ in found])
+        apart = np.stack([cKDTree(pixels[own]).query(missing)[0] for _, own in fits])
+        values = np.stack([_design(missing) @ plane for plane, _ in fits])
         value = np.take_along_axis(values, apart.argmin(0)[None], 0)[0]
         result[missing[:, 0], missing[:, 1]] = np.where(
             value > 0, 1 / np.where(value > 0, value, 1), 0
@@ -58,7 +61,8 @@ def patches(colors: np.ndarray) -> np.ndarray:
     one = np.concatenate([place[:, :-1][along], place[:-1][down]])
     other = np.concatenate([place[:, 1:][along], place[1:][down]])
     graph = coo_matrix((np.ones(len(one)), (one, other)), shape=(place.size, place.size))
-    return connected_components(graph, directed=False)[1].reshape(height, width).astype(np.int64)  # type: ignore[no-any-return]
+    labels = connected_components(graph, directed=False)[1]
+    return np.asarray(labels.reshape(height, width), np.int64)
 
 
 def planes(pixels: np.ndarray, inverse: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -67,10 +71,10 @@ def planes(pixels: np.ndarray, inverse: np.ndarray) -> list[tuple[np.ndarray, np
 
     Args: pixels [P, 2] (row, column) and their 1 / z [P].
     """
-    found: list[tuple[np.ndarray, np.ndarray]] = []
+    fits: list[tuple[np.ndarray, np.ndarray]] = []
     rng, left = np.random.default_rng(0), np.arange(len(pixels))
     design = _design(pixels)
-    while len(found) < PLANES and len(left) >= max(KNOWN, OWN * len(pixels)):
+    while len(fits) < PLANES and len(left) >= max(KNOWN, OWN * len(pixels)):
         triples = left[rng.integers(0, len(left), (DRAWS, 3))]
         # twice the triangle's pixels
         triples = triples[np.abs(np.linalg.det(design[triples])) > 0.5]
@@ -81,9 +85,9 @@ def planes(pixels: np.ndarray, inverse: np.ndarray) -> list[tuple[np.ndarray, np
         own = left[on[on.sum(1).argmax()]]
         if len(own) < max(KNOWN, OWN * len(pixels)):
             break
-        found.append((np.linalg.lstsq(design[own], inverse[own], rcond=None)[0], own))
+        fits.append((np.linalg.lstsq(design[own], inverse[own], rcond=None)[0], own))
         left = np.setdiff1d(left, own)
-    return found
+    return fits
 
 
 def _design(pixels: np.ndarray) -> np.ndarray:

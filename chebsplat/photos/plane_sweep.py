@@ -1,7 +1,7 @@
-"""Depth of posed photos by a plane sweep: how well views agree at each of many depths (Collins
-1996; MVSNet's volumes).
+"""Depth of posed photos by a plane sweep: agreement of views at each of many depths (Collins 1996;
+MVSNet's volumes).
 
-Which depths of a photo other photos confirm, and which they see through.
+Then depths of a photo that others confirm, and do not see through.
 
 Images are grey f32 [V, H, W] in [0, 1], reduced; cameras K [V, 3, 3] in their pixels (centres at
 half integers) and cam_from_world [V, 4, 4]; depth is z in scene units.
@@ -18,7 +18,7 @@ from chebsplat.kernels.jit import kernel, prange
 
 # half widths in pixels: of the patches that are compared, and of the mean over their costs
 WINDOW, SMOOTH = 1, 1
-FLAT = 1e-4  # variance that patches are given: two without texture are alike
+FLAT = 1e-4  # added to variances: two patches without texture are alike
 BRIGHT = 0.3  # weight of a difference in brightness, as a logarithm, beside 1 - correlation
 OUTSIDE = 4.0  # cost of a pixel that the other view does not see
 AT_ONCE = 8  # depths: what they take stays in a processor's cache
@@ -80,12 +80,12 @@ def swept_depth(
             place = torch.stack([x / z / width * 2 - 1, y / z / height * 2 - 1], -1).nan_to_num(
                 nan=-9.0
             )
-            seen = F.grid_sample(
+            sampled = F.grid_sample(
                 pair.expand(len(some), -1, -1, -1),
                 place.reshape(len(some), height, width, 2),
                 align_corners=False,
             )
-            warped, counts = seen[:, 0], seen[:, 1] > 0.9
+            warped, counts = sampled[:, 0], sampled[:, 1] > 0.9
             their_mean, their_spread = _moments(warped)
             covariance = box_mean(warped * grey[view], WINDOW) - their_mean * mean
             correlation = ((covariance + FLAT) / (their_spread * spread + FLAT)).clamp(-1, 1)
@@ -112,15 +112,13 @@ def _moments(values: Tensor) -> tuple[Tensor, Tensor]:
 def agreed(
     depth: np.ndarray, Ks: np.ndarray, poses: np.ndarray, others: np.ndarray, least: int
 ) -> np.ndarray:
-    """Depth f32 [V, h, w] that others agree on: the mean of what they and the view itself have; 0
-    elsewhere.
+    """Depth f32 [V, h, w] that others confirm: the mean of theirs and the view's own; 0 elsewhere.
 
     Args: depth [V, h, w], 0 where none is known; Ks [V, 3, 3] in its pixels; cam_from_world [V, 4,
-      4];
-          others i64 [V, M]: the views that each is compared with, -1: none; least: of them that
-            must confirm a pixel.
+      4]; others i64 [V, M]: the views that each is compared with, -1: none; least: of them that
+      must confirm a pixel.
     Choices: a view denies a point where it sees farther than that: nothing can be there. What a
-      view sees before a point hides it, and says nothing.
+      view sees before a point hides it, and does not count.
     """
     rotations, eyes = poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3:]
     to_world = np.concatenate([rotations @ np.linalg.inv(Ks), -rotations @ eyes], 2)

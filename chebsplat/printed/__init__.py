@@ -1,5 +1,6 @@
 """The paper's method as printed, in plain torch: one module a section, to be read beside the paper.
 
-Where the print is silent or divides by zero, the function says what it does and why; docs/method.md
-lists the same choices in its table. `training.printed` runs these modules; nothing here is tuned.
+Where the print is silent or divides by zero, the function's docstring has the choice and the
+reason; docs/method.md lists the same choices in its table. `training.printed` runs these modules;
+nothing here is tuned.
 """

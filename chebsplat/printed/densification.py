@@ -26,8 +26,8 @@ def candidate_counts(volumes: Tensor, n_points: Tensor, density: float, most: in
     Args: volumes [M], scene units^3; n_points i64 [M]; density alpha_d, 1 / scene units^3.
     Choices: rounded up; 0 for a region without points, where the print divides by zero.
     """
-    wanted = density * volumes / n_points.clamp_min(1)
-    counts = wanted.ceil().clamp(0, most).long()
+    exact = density * volumes / n_points.clamp_min(1)
+    counts = exact.ceil().clamp(0, most).long()
     return torch.where(n_points > 0, counts, 0)
 
 

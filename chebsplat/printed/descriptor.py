@@ -75,9 +75,9 @@ def eigenpairs(weights: Tensor, present: Tensor, n_eigs: int) -> tuple[Tensor, T
     if (ill_conditioned := least < CONDITION * degree.amax(-1)).any():
         operator = laplacian(weights[ill_conditioned], present[ill_conditioned])
         absent = torch.where(present[ill_conditioned], 0.0, 10.0).to(weights)
-        found, right = torch.linalg.eig(operator + torch.diag_embed(absent))
-        order = found.real.argsort(-1)
-        values[ill_conditioned] = found.real.gather(-1, order)
+        roots, right = torch.linalg.eig(operator + torch.diag_embed(absent))
+        order = roots.real.argsort(-1)
+        values[ill_conditioned] = roots.real.gather(-1, order)
         vectors[ill_conditioned] = right.real.gather(-1, order[..., None, :].expand_as(right))
     count = min(n_eigs, n)
     is_there = torch.arange(count) < present.sum(-1, keepdim=True)
@@ -131,9 +131,7 @@ def descriptor(
 
 
 def symmetric_eigh(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """`torch.linalg.eigh` by NumPy: torch wakes all threads for each small matrix, and waits where
-    others compute.
-    """
+    """`torch.linalg.eigh` by NumPy: torch wakes all threads for each small matrix."""
     values, vectors = np.linalg.eigh(matrices.numpy())
     return torch.from_numpy(values), torch.from_numpy(vectors)
 

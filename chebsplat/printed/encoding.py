@@ -52,8 +52,8 @@ class Layer(nn.Module):
 
     def forward(self, z: Tensor, present: Tensor) -> Tensor:
         """z [..., t, Q], present [..., t] -> [..., t, Q]."""
-        seen = self.norm_attention(z)
-        z = z + attention(seen, self.query, self.key, self.value, present)
+        normed = self.norm_attention(z)
+        z = z + attention(normed, self.query, self.key, self.value, present)
         hidden = nn.functional.gelu(self.forward_1(self.norm_forward(z)))
         changed: Tensor = z + self.forward_2(hidden)
         return changed

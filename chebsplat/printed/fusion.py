@@ -10,8 +10,8 @@ class Gate(nn.Module):
     """f_final = g * f_sem + (1 - g) * f_shape, g = linear([f_shape, f_sem]) (Eq 10).
 
     The print has a linear map and no sigmoid, and gives g no shape: one value a channel, as its
-    elementwise product asks. It starts at a half. A point in no region,
-    such as one outside the frustum, keeps its semantic feature.
+    elementwise product asks. It starts at a half. A point in no region, such as one outside the
+    frustum, keeps its semantic feature.
     """
 
     def __init__(self, n_channels: int):

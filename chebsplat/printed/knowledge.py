@@ -73,13 +73,13 @@ def update(
     U, values, _ = torch.linalg.svd(projected(W, B)[1], full_matrices=False)
     energy = values.square().cumsum(0)
     count = int((energy < eta * energy[-1]).sum()) + 1
-    return _orthonormal(torch.cat([B, U[:, :count]], 1), kept=B.shape[1])
+    return _orthonormal(torch.cat([B, U[:, :count]], 1), n_fixed=B.shape[1])
 
 
-def _orthonormal(columns: Tensor, kept: int) -> Tensor:
-    """Gram-Schmidt, each column twice, after the first `kept`; dependent columns are dropped."""
-    basis = columns[:, :kept]
-    for column in columns[:, kept:].mT:
+def _orthonormal(columns: Tensor, n_fixed: int) -> Tensor:
+    """Gram-Schmidt, each column twice, after the first `n_fixed`; dependent columns are dropped."""
+    basis = columns[:, :n_fixed]
+    for column in columns[:, n_fixed:].mT:
         for _ in range(2):
             column = column - basis @ (basis.mT @ column)
         length = column.norm()

@@ -1,6 +1,4 @@
-"""From regions back to points (Eqs 8-9). A pair is a point i64 [E] and a region i64 [E] that holds
-it.
-"""
+"""From regions to points (Eqs 8-9). A pair: a point i64 [E] and a region i64 [E] that holds it."""
 
 from __future__ import annotations
 

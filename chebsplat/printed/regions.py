@@ -21,8 +21,7 @@ class Regions(NamedTuple):
 
     centers i64 [M]: the points at their centres. pairs: (point i64 [E], region i64 [E]), one for
     each point in a ball. members i64 [M, n], -1 where padded: those that the region is encoded
-      from,
-    its centre first. radius: scene units.
+    from, its centre first. radius: scene units.
     """
 
     centers: Tensor

@@ -28,17 +28,17 @@ def rasterize(
     if backend == "auto":
         on_cpu = "cpu" if means.dtype == torch.float32 else "reference"
         backend = {"cuda": "cuda", "cpu": on_cpu}.get(means.device.type, "reference")
-    chosen: Any
+    module: Any
     # spelt out, not looked up by name: a stage's identity is the code that it imports
     if backend == "cpu":
-        from chebsplat.rasterize import cpu as chosen
+        from chebsplat.rasterize import cpu as module
     elif backend == "cuda":
-        from chebsplat.rasterize import cuda as chosen
+        from chebsplat.rasterize import cuda as module
     elif backend == "reference":
-        from chebsplat.rasterize import reference as chosen
+        from chebsplat.rasterize import reference as module
     else:
         raise ValueError(f"backend {backend!r} is none of auto, cpu, cuda, reference")
-    rendered: tuple[Tensor, Tensor, dict[str, Any]] = chosen.rasterize(means, *args, **options)
+    rendered: tuple[Tensor, Tensor, dict[str, Any]] = module.rasterize(means, *args, **options)
     return rendered
 
 

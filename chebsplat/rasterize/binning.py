@@ -1,10 +1,9 @@
-"""Which Gaussians touch which tiles, front to back.
+"""Binning of Gaussians to the tiles that they touch, front to back.
 
 A Gaussian touches a tile through one *pair*. Pairs are numbered by band of tile rows, then Gaussian
 by Gaussian: the gradient records that a Gaussian collects in a band lie together and are summed in
-  a fixed order. No atomics, the same
-bits for any number of threads, and records for one band at a time. Work is dealt out in PARTS,
-whatever the threads.
+a fixed order. No atomics, the same bits for any number of threads, and records for one band at a
+time. Work is dealt out in PARTS, whatever the threads.
 """
 
 from __future__ import annotations
@@ -85,9 +84,7 @@ def _usable(radii, opacities, colors, cell_colors, i):
 
 @serial
 def _sort(index, keys):
-    """`index` by ascending key, ties as they come: a radix sort, faster on one thread than dealt
-    out to several.
-    """
+    """`index` by ascending key, ties as they come: a radix sort, fastest on one thread."""
     n, size = len(index), 1 << DIGIT
     other_index, other_keys = np.empty_like(index), np.empty_like(keys)
     mask = np.uint32(size - 1)
@@ -118,10 +115,8 @@ def _boxes(means2d, covariances, radii, opacities, colors, cell_colors, width, h
 
 
 @serial
-def _shown(boxes, depths):
-    """Indices of the Gaussians that touch a tile, and their depths as keys that sort alike: depths
-    are positive.
-    """
+def _depth_keys(boxes, depths):
+    """Indices of the Gaussians that touch a tile; their depths, positive, as keys of that order."""
     index, keys, bits = (
         np.empty(len(boxes), np.int32),
         np.empty(len(boxes), np.uint32),
@@ -190,8 +185,8 @@ def _deal(order, boxes, columns, rows):
 
 
 def bin_gaussians(
-    means2d: np.ndarray, covariances: np.ndarray, depths: np.ndarray, radii: np.ndarray, opacities: np.ndarray,
-    colors: np.ndarray, cell_colors: np.ndarray, width: int, height: int,
+    means2d: np.ndarray, covariances: np.ndarray, depths: np.ndarray, radii: np.ndarray,
+    opacities: np.ndarray, colors: np.ndarray, cell_colors: np.ndarray, width: int, height: int,
 ) -> Bins:  # fmt: skip
     """Pairs of Gaussians and tiles of one view.
 
@@ -200,7 +195,7 @@ def bin_gaussians(
       or in any channel, touches nothing. Ties in depth go by index.
     """
     boxes = _boxes(means2d, covariances, radii, opacities, colors, cell_colors, width, height)
-    order = _sort(*_shown(boxes, depths))
+    order = _sort(*_depth_keys(boxes, depths))
     return Bins(
         order, *_deal(order, boxes, (width + TILE - 1) // TILE, (height + TILE - 1) // TILE)
     )

@@ -1,6 +1,4 @@
-"""What the tiles' kernels are made of: a queue, prefetching, small dense products and transposes,
-whose sums stay in registers.
-"""
+"""Blocks of the tiles' kernels: a queue, prefetching, products and transposes in registers."""
 
 from __future__ import annotations
 
@@ -25,9 +23,7 @@ WORKERS = 256  # that take work from a queue: at most as many threads do so at o
 
 @intrinsic
 def claim(_typing, counter):
-    """The next number of a shared counter i64 [1], from what it holds on; each is given to one
-    thread alone.
-    """
+    """The next number of a shared counter i64 [1]; each goes to one thread alone."""
 
     def build(context, builder, sig, args):
         place = address(
@@ -57,9 +53,7 @@ def prefetch(_typing, array, index):
 
 @intrinsic
 def to_lanes(_typing, out, out_at, a, a_at, a_step):
-    """Transpose 16 rows of 4: out.flat[out_at + 16 c + lane] = a.flat[a_at + lane a_step + c] for c
-    < 4.
-    """
+    """Transpose 16 rows of 4: out.flat[out_at + 16 c + lane] = a.flat[a_at + lane a_step + c]."""
     four = ir.VectorType(FLOAT, 4)
 
     def build(context, builder, sig, args):
@@ -93,9 +87,7 @@ def to_lanes(_typing, out, out_at, a, a_at, a_step):
 
 @intrinsic
 def from_lanes(_typing, out, out_at, out_step, a, a_at):
-    """The way back of `to_lanes`: out.flat[out_at + lane out_step + c] = a.flat[a_at + 16 c + lane]
-    for c < 4.
-    """
+    """Inverse of `to_lanes`: out.flat[out_at + lane out_step + c] = a.flat[a_at + 16 c + lane]."""
     four = ir.VectorType(FLOAT, 4)
 
     def build(context, builder, sig, args):
@@ -122,8 +114,8 @@ def from_lanes(_typing, out, out_at, out_step, a, a_at):
 
 @intrinsic
 def hits_among(_typing, masks, at, n, bit, first, hits, count):
-    """Which of masks[at : at + min(n, 16)] have a bit set: numbered from `first`, into hits[count:]
-    without a gap.
+    """Pack numbers, from `first`, of those masks[at : at + min(n, 16)] that have a bit set into
+    hits[count:].
 
     Args: masks u16, 16 more than n; hits u32, of which 16 from `count` on are written. Returns:
       count after.
@@ -140,20 +132,20 @@ def hits_among(_typing, masks, at, n, bit, first, hits, count):
     def build(context, builder, sig, args):
         masks, at, n, bit, first, hits, count = args
         counted = ir.Constant(words, list(range(16)))
-        given = builder.load(address(context, builder, sig.args[0], masks, at, narrow), align=2)
-        held = builder.trunc(
-            builder.lshr(given, builder.trunc(filled(builder, bit), narrow)), flags
+        loaded = builder.load(address(context, builder, sig.args[0], masks, at, narrow), align=2)
+        is_set = builder.trunc(
+            builder.lshr(loaded, builder.trunc(filled(builder, bit), narrow)), flags
         )
-        held = builder.and_(held, builder.icmp_signed("<", counted, filled(builder, n)))
+        is_set = builder.and_(is_set, builder.icmp_signed("<", counted, filled(builder, n)))
         kind = ir.FunctionType(words, [words, flags, words])
         compress = cgutils.get_or_insert_function(
             builder.module, kind, "llvm.experimental.vector.compress.v16i32"
         )
         numbers = builder.add(counted, filled(builder, first))
-        packed = builder.call(compress, [numbers, held, ir.Constant(words, ir.Undefined)])
+        packed = builder.call(compress, [numbers, is_set, ir.Constant(words, ir.Undefined)])
         builder.store(packed, address(context, builder, sig.args[5], hits, count, words), align=4)
         return builder.add(
-            count, builder.zext(builder.ctpop(builder.bitcast(held, ir.IntType(16))), count.type)
+            count, builder.zext(builder.ctpop(builder.bitcast(is_set, ir.IntType(16))), count.type)
         )
 
     at = types.intp
@@ -161,8 +153,8 @@ def hits_among(_typing, masks, at, n, bit, first, hits, count):
 
 
 @intrinsic(prefer_literal=True)
-def multiply(_typing, out, out_at, order, order_at, out_step, a, a_at, a_row, a_step, by, by_at, by_kind, b, b_at,
-             b_step, depth, rows, width, add):  # fmt: skip
+def multiply(_typing, out, out_at, order, order_at, out_step, a, a_at, a_row, a_step, by, by_at,
+             by_kind, b, b_at, b_step, depth, rows, width, add):  # fmt: skip
     """out[order[i], :width] (+)= Σ_k a[i, k] b[k, :width] for i < rows, k < depth; the sums stay in
     registers.
 

@@ -1,5 +1,4 @@
-"""The adjoint of compositing inside one cell (see `cells`): from gradients of pixels to records of
-Gaussians.
+"""Adjoint of compositing inside a cell (see `cells`): records of Gaussians from pixels' gradients.
 
 With g = dL/d(log₂ α), a record holds Σg, Σgu, Σgv, Σgu², Σguv, Σgv², Σ|g_x|, Σ|g_y| over the pixels
 of a tile, then the gradients to the channels, in fours, and to the cell channels, in whole vectors.
@@ -32,13 +31,11 @@ from chebsplat.rasterize.cells import (
 
 @lanes
 def slopes(shapes, rows, grads, count, cell, depth, out):
-    """out[m] = dL/d(weight m) by lane: the image's gradients [cells, depth, 16] times the channels
-    of rows[m].
-    """
+    """out[m] = dL/d(weight m) by lane: gradients [cells, depth, 16] times channels of rows[m]."""
     at, step = LANES * cell * grads.shape[1], shapes.shape[1]
     for m in range(0, count, BLOCK):
-        multiply(out, LANES * m, IN_ORDER, 0, LANES, shapes, SHAPE, step, 1, rows, m, 1, grads, at, LANES, depth,
-                 8, LANES, 0)  # fmt: skip
+        multiply(out, LANES * m, IN_ORDER, 0, LANES, shapes, SHAPE, step, 1, rows, m, 1,
+                 grads, at, LANES, depth, 8, LANES, 0)  # fmt: skip
 
 
 @lanes
@@ -70,23 +67,21 @@ def record_colors(weights, tall_grads, channels, count, cell, slots, records):
     for m in range(0, count, BLOCK):
         c = 0
         while c + 16 <= channels:
-            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, slots, 0, 0,
-                     tall_grads, at + c, row, LANES, 8, 16, 1)  # fmt: skip
+            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1,
+                     slots, 0, 0, tall_grads, at + c, row, LANES, 8, 16, 1)  # fmt: skip
             c += 16
         if c + 8 <= channels:
-            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, slots, 0, 0,
-                     tall_grads, at + c, row, LANES, 8, 8, 1)  # fmt: skip
+            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1,
+                     slots, 0, 0, tall_grads, at + c, row, LANES, 8, 8, 1)  # fmt: skip
             c += 8
         if c < channels:
-            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1, slots, 0, 0,
-                     tall_grads, at + c, row, LANES, 8, 4, 1)  # fmt: skip
+            multiply(records, N_GEOMETRY + c, slots, m, step, weights, LANES * m, LANES, 1,
+                     slots, 0, 0, tall_grads, at + c, row, LANES, 8, 4, 1)  # fmt: skip
 
 
 @lanes
 def add_slopes_of_means(splats, column, ranks, start, rows, count, cell, mean_grads, out):
-    """out[m] += the cell's gradient [cells, E] times Gaussian m's cell channels, the same at every
-    lane.
-    """
+    """out[m] += the cell's gradient [cells, E] times Gaussian m's cell channels, at every lane."""
     for m in range(count):
         offset = np.int64(ranks[start + rows[m]]) * splats.shape[1] + column
         slope = splat(ZERO)
@@ -130,20 +125,17 @@ def record_geometry(g, count, cell, slots, records):
     """records[slots[m], :6] += Σ_lanes g (1, x, y, x², xy, y²), offsets from the tile's middle."""
     at = LANES * SHAPE * cell
     for m in range(0, count, BLOCK):
-        multiply(records, 0, slots, m, records.shape[1], g, LANES * m, LANES, 1, slots, 0, 0, MOMENTS, at, SHAPE, LANES,
-                 8, 8, 1)  # fmt: skip
+        multiply(records, 0, slots, m, records.shape[1], g, LANES * m, LANES, 1,
+                 slots, 0, 0, MOMENTS, at, SHAPE, LANES, 8, 8, 1)  # fmt: skip
 
 
 @lanes
 def whiten(records, at, shapes, k):
-    """Turn a record's moments in (x, y) into those in (u, v), in float64: Σ g (1, u, v, u², uv,
-    v²).
-    """
+    """Turn a record's moments in (x, y) to (u, v), in float64: Σ g (1, u, v, u², uv, v²)."""
     p, q, r = np.float64(shapes[k, 0]), np.float64(shapes[k, 1]), np.float64(shapes[k, 2])
     u, v = np.float64(shapes[k, 3]), np.float64(shapes[k, 4])
-    g_0, x, y, xx, xy, yy = (
-        records[at, 0], records[at, 1], records[at, 2], records[at, 3], records[at, 4], records[at, 5]
-    )  # fmt: skip
+    g_0, x, y = records[at, 0], records[at, 1], records[at, 2]
+    xx, xy, yy = records[at, 3], records[at, 4], records[at, 5]
     near_u, near_v = p * x + q * y, r * y
     g_u, g_v = u * g_0 + near_u, v * g_0 + near_v
     records[at, 1], records[at, 2] = g_u, g_v

@@ -3,9 +3,8 @@
 At an offset d from a Gaussian's mean, (u, v) = W d and log₂ α = log₂ opacity − u² − v², with W =
 [[p, q], [0, r]] (see `ellipses`). A tile holds 16 cells and, for each of its Gaussians, a row of
 `shapes`: p, q, r, then u and v at the middle of the tile, log₂ opacity, and from SHAPE on the
-  channels. Sweeping a cell lists the Gaussians that contribute to
-it, with α and the weight α T by lane; what remains are products of small dense matrices, whose sums
-stay in registers.
+channels. Sweeping a cell lists the Gaussians that contribute to it, with α and the weight α T by
+lane; what remains are products of small dense matrices, whose sums stay in registers.
 """
 
 from __future__ import annotations
@@ -109,15 +108,13 @@ def begin(states, width, height):
 
 @lanes
 def is_done(states, cell):
-    """Whether no pixel of a cell takes more."""
+    """True where no pixel of a cell takes more."""
     return bits(load(states, 2 * LANES * cell + LANES) < splat(NEVER)) == 0
 
 
 @lanes
 def listed(masks, at, n, cell, hits):
-    """Which of masks[at : at + n] hold this cell, into `hits`; both have 16 more. Returns how
-    many.
-    """
+    """Rows of masks[at : at + n] with this cell, into `hits`; their count. Both have 16 more."""
     count = 0
     for k in range(0, n, LANES):
         count = hits_among(masks, at + k, n - k, cell, k, hits, count)
@@ -144,7 +141,7 @@ def sweep(shapes, hits, n, cell, max_alpha, states, alphas, weights, rows):
 
     Args: hits [n] rows of `shapes`; states as `begin` fills them; alphas, weights and rows have
       room for n.
-    Returns: how many contribute; rows[:count] says which.
+    Returns: count of those that contribute; rows[:count] are their rows.
     Choices: no branch on whether a Gaussian contributes: the next one's row takes its place where
       it does not.
     """
@@ -156,8 +153,10 @@ def sweep(shapes, hits, n, cell, max_alpha, states, alphas, weights, rows):
         u = fma(splat(shapes[k, 0]), x, fma(splat(shapes[k, 1]), y, splat(shapes[k, 3])))
         v = fma(splat(shapes[k, 2]), y, splat(shapes[k, 4]))
         power = fnma(u, u, fnma(v, v, splat(shapes[k, 5])))
-        seen, alpha = power >= least, _exp2(power)
-        alpha = where(seen, where(alpha < splat(max_alpha), alpha, splat(max_alpha)), splat(ZERO))
+        visible, alpha = power >= least, _exp2(power)
+        alpha = where(
+            visible, where(alpha < splat(max_alpha), alpha, splat(max_alpha)), splat(ZERO)
+        )
         after = fnma(alpha, t, t)
         closing = after <= splat(T_MIN)
         if bits(closing) != 0:  # those pixels are done, without this Gaussian
@@ -168,7 +167,7 @@ def sweep(shapes, hits, n, cell, max_alpha, states, alphas, weights, rows):
         store(alphas, LANES * count, alpha)
         store(weights, LANES * count, alpha * t)
         rows[count] = k
-        count += bits(seen) != 0
+        count += bits(visible) != 0
         t = after
     store(states, 2 * LANES * cell, t)
     store(states, 2 * LANES * cell + LANES, least)
@@ -177,19 +176,17 @@ def sweep(shapes, hits, n, cell, max_alpha, states, alphas, weights, rows):
 
 @lanes
 def accumulate(shapes, rows, weights, count, cell, sums):
-    """sums[cell, c] += Σ_m shapes[rows[m], SHAPE + c] weights[m]: [cells, channels, 16], channels
-    in fours.
-    """
+    """sums[cell, c] += Σ_m shapes[rows[m], SHAPE + c] weights[m]: [cells, channels, 16]."""
     channels, step = sums.shape[1], shapes.shape[1]
     for c in range(0, channels - 7, BLOCK):
         at = LANES * (cell * channels + c)
-        multiply(sums, at, IN_ORDER, 0, LANES, shapes, SHAPE + c, 1, step, rows, 0, 2, weights, 0, LANES, count,
-                 8, LANES, 1)  # fmt: skip
+        multiply(sums, at, IN_ORDER, 0, LANES, shapes, SHAPE + c, 1, step, rows, 0, 2,
+                 weights, 0, LANES, count, 8, LANES, 1)  # fmt: skip
     if channels % BLOCK != 0:
         c = channels - 4
         at = LANES * (cell * channels + c)
-        multiply(sums, at, IN_ORDER, 0, LANES, shapes, SHAPE + c, 1, step, rows, 0, 2, weights, 0, LANES, count,
-                 4, LANES, 1)  # fmt: skip
+        multiply(sums, at, IN_ORDER, 0, LANES, shapes, SHAPE + c, 1, step, rows, 0, 2,
+                 weights, 0, LANES, count, 4, LANES, 1)  # fmt: skip
 
 
 @lanes
@@ -201,9 +198,7 @@ def sum_lanes(weights, count, sums):
 
 @lanes
 def accumulate_means(splats, column, ranks, start, rows, shares, count, cell, sums):
-    """sums[cell] += Σ_m shares[m] splats[m, column:]: the cell channels, [cells, E], E a multiple
-    of 16.
-    """
+    """sums[cell] += Σ_m shares[m] splats[m, column:]: cell channels [cells, E], E in sixteens."""
     for d in range(0, sums.shape[1], LANES):
         at = cell * sums.shape[1] + d
         summed = load(sums, at)
@@ -244,7 +239,7 @@ def clear(a, at, n):
 
 @lanes
 def is_finite(a, at, n):
-    """Whether all of a.flat[at : at + n] is finite; n a multiple of LANES."""
+    """True where all of a.flat[at : at + n] is finite; n a multiple of LANES."""
     sums = splat(ZERO)
     for k in range(0, n, LANES):
         sums = fma(load(a, at + k), splat(ZERO), sums)

@@ -15,13 +15,11 @@ NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "c
 
 
 class _Project(torch.autograd.Function):
-    """means2d [N, 2], covariances [N, 3] and compensations [N] of one view; the rest comes without
-    gradient.
+    """means2d [N, 2], covariances [N, 3], compensations [N] of one view; the rest without gradient.
 
     What comes back for `covariances`, which stay between the two Functions, is not their gradient
-    but the whitened
-    moments that `ellipses.project_adjoint` takes: they keep the precision that the gradient would
-      lose.
+    but the whitened moments that `ellipses.project_adjoint` takes: they keep the precision that the
+    gradient would lose.
     """
 
     @staticmethod
@@ -45,15 +43,13 @@ class _Project(torch.autograd.Function):
 
 
 class _Composite(torch.autograd.Function):
-    """Render [H, W, D], means over cells, and alpha [H, W] of one view; backward also adds to
-    `absgrad` if given.
-    """
+    """Render [H, W, D], cell means, alpha [H, W] of one view; backward adds to any `absgrad`."""
 
     @staticmethod
     def forward(
-        ctx: Any, means2d: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor, cell_colors: Tensor,
-        whitening: Tensor, depths: Tensor, radii: Tensor, absgrad: Tensor | None, size: tuple[int, int],
-        max_alpha: float, view: int,
+        ctx: Any, means2d: Tensor, covariances: Tensor, opacities: Tensor, colors: Tensor,
+        cell_colors: Tensor, whitening: Tensor, depths: Tensor, radii: Tensor,
+        absgrad: Tensor | None, size: tuple[int, int], max_alpha: float, view: int,
     ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
         centers, spreads, strengths, whitened, z, reach = (
             t.detach().contiguous().numpy()
@@ -131,8 +127,11 @@ def rasterize(
     if viewmats.requires_grad or Ks.requires_grad:
         raise ValueError("the cpu backend gives cameras no gradient: use the reference")
     antialiased = is_antialiased(rasterize_mode)
-    cameras = [(*(t.detach().double().contiguous().numpy() for t in pair), width, height, near_plane, far_plane, eps2d)
-               for pair in zip(viewmats, Ks, strict=True)]  # fmt: skip
+    frame = (width, height, near_plane, far_plane, eps2d)
+    cameras = [
+        (*(t.detach().double().contiguous().numpy() for t in pair), *frame)
+        for pair in zip(viewmats, Ks, strict=True)
+    ]
     views = [_Project.apply(means, quats, scales, camera) for camera in cameras]
     projected = (_stack(parts) for parts in zip(*views, strict=True))
     means2d, covariances, whitening, conics, depths, radii, compensations = projected
@@ -143,8 +142,10 @@ def rasterize(
         means2d.absgrad = absolute  # type: ignore[attr-defined]
     composed = [
         _Composite.apply(
-            means2d[c], covariances[c], compensated(opacities, compensations[c]) if antialiased else opacities,
-            colors if colors.ndim == 2 else colors[c], in_cells if in_cells.ndim == 2 else in_cells[c],
+            means2d[c], covariances[c],
+            compensated(opacities, compensations[c]) if antialiased else opacities,
+            colors if colors.ndim == 2 else colors[c],
+            in_cells if in_cells.ndim == 2 else in_cells[c],
             whitening[c], depths[c], radii[c],
             absolute[c] if absgrad else None, (width, height), max_alpha, c,
         )

@@ -42,17 +42,14 @@ def rasterize(
     Args: harmless: the Gaussians are those that `made_harmless` returns.
     Raises: ValueError unless the Gaussians are float32 on a GPU, for a `max_alpha` above 0.999, or
       beyond 512 channels; ImportError, with the remedy, without gsplat.
-    Choices: gsplat fixes the ceiling of alpha at 0.999; a lower one is kept by what a Gaussian's
-      opacity is at most, so that no alpha exceeds it. Renders are those of the other backends where
-      no opacity is above `max_alpha`; where one is, alpha is the same at its middle and lower by up
-      to a hundredth around it. The gradient passes as
-      if there were no ceiling: a Gaussian that has reached it can become fainter again. What lies
-        in the near plane
-      is cut, as elsewhere. Covariances are float32: a needle a billion times as long as wide is
-        drawn wider than it
-      is. All channels go at once: of gsplat's chunks only one would leave its absolute gradient. A
-        broken Gaussian is
-      replaced by one that nobody sees, because gsplat would draw a NaN opaque.
+    Choices: gsplat fixes the ceiling of alpha at 0.999; a lower one is kept by a ceiling of
+      opacities, so that no alpha exceeds it. Renders are those of the other backends where no
+      opacity is above `max_alpha`; where one is, alpha is the same at its middle and lower by up to
+      a hundredth around it. The gradient passes as if there were no ceiling: a Gaussian that has
+      reached it can become fainter again. What lies in the near plane is cut, as elsewhere.
+      Covariances are float32: a needle a billion times as long as wide is drawn wider than it is.
+      All channels go at once: of gsplat's chunks only one would leave its absolute gradient. A
+      broken Gaussian is replaced by an invisible one, because gsplat would draw a NaN opaque.
     """
     is_antialiased(rasterize_mode)
     if means.dtype != torch.float32 or means.device.type != "cuda":
@@ -67,7 +64,7 @@ def rasterize(
             f"{colors.shape[-1]} channels; the cuda backend takes at most {MOST} channels"
         )
     rasterization = gsplat().rasterization
-    if len(means) == 0:  # the background: gsplat is not asked to sort an empty scene
+    if len(means) == 0:  # the background: gsplat does not sort an empty scene
         empty = (
             means,
             quats,
@@ -90,8 +87,8 @@ def rasterize(
     nearest = float(np.nextafter(np.float32(near_plane), np.float32(np.inf)))
     renders, alphas, gsplat_meta = rasterization(
         *gaussians, viewmats, Ks, width, height,
-        near_plane=nearest, far_plane=far_plane, eps2d=eps2d, sh_degree=None, packed=False, render_mode="RGB",
-        backgrounds=backgrounds, absgrad=absgrad, rasterize_mode=rasterize_mode,
+        near_plane=nearest, far_plane=far_plane, eps2d=eps2d, sh_degree=None, packed=False,
+        render_mode="RGB", backgrounds=backgrounds, absgrad=absgrad, rasterize_mode=rasterize_mode,
         channel_chunk=max(CHUNK, colors.shape[-1]),
     )  # fmt: skip
     meta = own_meta(gsplat_meta)
@@ -113,9 +110,8 @@ def made_harmless(
     quaternions scaled.
 
     Choices: a Gaussian's values are looked at together, by their sum, which is finite where each of
-      them is (or takes
-      one for broken whose values are beyond all measure): each question to a GPU takes as long as a
-        sum.
+      them is (or takes one for broken whose values are beyond all measure): each question to a GPU
+      takes as long as a sum.
     """
     opacities = opacities + (opacities.clamp_max(max_alpha) - opacities).detach()
     by_camera = colors.ndim == 3

@@ -1,10 +1,8 @@
-"""Where a ray meets the surface that Gaussians show: their planes' depth, late in what the pixel is
-made of.
+"""Depth where a ray meets the surface of Gaussians: their planes' depth, late in a pixel's light.
 
 Gaussians of a wall overlap in depth and each covers little, so the first ones that a ray meets
-already take part of its
-weight: the mean over all lies in front of the wall. The surface is where most of the light has been
-  gathered.
+already take part of its weight: the mean over all lies in front of the wall. The surface is where
+most of the light has been gathered.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from chebsplat.rasterize.cells import LANES, SHAPE, ZERO
 from chebsplat.rasterize.lift import MAX_ALPHA, binned
 from chebsplat.rasterize.tiles import fill_shapes
 
-COVERED = (0.7, 0.9)  # of the light, which part of it tells the depth
+COVERED = (0.7, 0.9)  # part of the light, front to back, that the depth is taken from
 
 
 @serial
@@ -84,8 +82,8 @@ def depths(
     planes: np.ndarray,
     part: tuple[float, float] = COVERED,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth of the surface, f32 [H, W] in scene units, inf where there is none, and how much is
-    covered [H, W].
+    """Depth of the surface, f32 [H, W] in scene units, inf where there is none, and coverage [H,
+    W].
 
     Args:
       gaussians: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], activated, float32.

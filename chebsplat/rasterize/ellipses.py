@@ -1,10 +1,9 @@
-"""Numba twin of `projection.project` for one view, and its adjoint: parallel over Gaussians,
-float64 inside.
+"""Numba twin of `projection.project` for one view, and its adjoint: parallel, float64 inside.
 
 Beside mean and covariance each Gaussian gets its whitening W = [[p, q], [0, r]], WᵀW = ½ log₂e Σ⁻¹,
 so that at an offset d from the mean log₂ α = log₂ opacity − |W d|². W comes from the determinant by
-Cauchy-Binet, which cannot
-cancel, and gradients are gathered in W d: a needle's are as exact as a ball's.
+Cauchy-Binet, which cannot cancel, and gradients are gathered in W d: a needle's are as exact as a
+ball's.
 """
 
 from __future__ import annotations
@@ -73,9 +72,7 @@ def _clamped(slope, center, focal, size):
 
 @inline
 def _jacobian(point, viewmat, K, width, height, out, jacobian):
-    """Fill the camera-space point [3] into `out` and d(pixel)/d(camera) [2, 3], slopes clamped,
-    into `jacobian`.
-    """
+    """Fill `out` [3], the camera-space point, and `jacobian` [2, 3] of the pixel, clamped."""
     for i in range(3):
         out[i] = viewmat[i, 3]
         for k in range(3):
@@ -108,9 +105,7 @@ def _cross(a, b, out):
 
 @inline
 def _ellipse(factor, eps2d, cross):
-    """F Fᵀ + ε I: xx, xy, yy, the determinant by Cauchy-Binet, and |f × g| of F's rows; f × g goes
-    into `cross`.
-    """
+    """F Fᵀ + ε I: xx, xy, yy, determinant by Cauchy-Binet, |f × g|; fills `cross` with f × g."""
     a = b = c = 0.0
     for k in range(3):
         a += factor[0, k] * factor[0, k]
@@ -124,8 +119,8 @@ def _ellipse(factor, eps2d, cross):
 
 @body
 def _project(
-    means, quats, scales, viewmat, turn, K, width, height, near_plane, far_plane, eps2d, first, last,
-    means2d, covariances, whitening, conics, depths, radii, compensations,
+    means, quats, scales, viewmat, turn, K, width, height, near_plane, far_plane, eps2d,
+    first, last, means2d, covariances, whitening, conics, depths, radii, compensations,
 ):  # fmt: skip
     """`project` of the Gaussians from `first` up to `last`, into what it returns."""
     unit, camera, cross = np.empty(4), np.empty(3), np.empty(3)
@@ -253,8 +248,8 @@ def _rotation_adjoint(unit, length, by, out):
 
 @body
 def _project_adjoint(
-    means, quats, scales, viewmat, turn, K, width, height, eps2d, radii, grad_means2d, moments, grad_compensations,
-    first, last, to_means, to_quats, to_scales,
+    means, quats, scales, viewmat, turn, K, width, height, eps2d, radii, grad_means2d,
+    moments, grad_compensations, first, last, to_means, to_quats, to_scales,
 ):  # fmt: skip
     """`project_adjoint` of the Gaussians from `first` up to `last`, into what it returns.
 
@@ -360,7 +355,7 @@ def project_adjoint(
     for part in prange(PARTS):
         first, last = part * n // PARTS, (part + 1) * n // PARTS
         _project_adjoint(
-            means, quats, scales, viewmat, turn, K, width, height, eps2d, radii, grad_means2d, moments,
-            grad_compensations, first, last, to_means, to_quats, to_scales,
+            means, quats, scales, viewmat, turn, K, width, height, eps2d, radii, grad_means2d,
+            moments, grad_compensations, first, last, to_means, to_quats, to_scales,
         )  # fmt: skip
     return to_means, to_quats, to_scales

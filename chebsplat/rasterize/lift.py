@@ -1,5 +1,4 @@
-"""The transpose of rendering cell means: what every cell of a view says, summed by the Gaussians
-that make it up.
+"""The transpose of rendering cell means: values of a view's cells, summed by Gaussian.
 
 A Gaussian's weight in a cell is the sum over its pixels of w = α T. As in `tiles_adjoint`, a tile
 fills the records of its pairs, and every Gaussian's records are summed in the order of its pairs:
@@ -20,13 +19,11 @@ from chebsplat.rasterize.blocks import WORKERS, claim
 from chebsplat.rasterize.cells import LANES, SHAPE, ZERO
 from chebsplat.rasterize.tiles import fill_shapes
 
-MAX_ALPHA, NEAR, FAR, EPS2D = np.float32(0.99), 0.01, 1e10, 0.3  # as `reference.rasterize` has them
+MAX_ALPHA, NEAR, FAR, EPS2D = np.float32(0.99), 0.01, 1e10, 0.3  # as `reference.rasterize`
 
 
 class Lifted(NamedTuple):
-    """What one view says of M Gaussians: ids i32 [M], ascending; weights f32 [M] > 0; sums f32 [M,
-    C].
-    """
+    """One view's observations: ids i32 [M], ascending; weights f32 [M] > 0; sums f32 [M, C]."""
 
     ids: np.ndarray
     weights: np.ndarray
@@ -69,28 +66,26 @@ def _lift_tile(
         count = cells.sweep(shapes, hits, count, cell, MAX_ALPHA, states, alphas, weights, rows)
         gated(weights, count, gate)
         cells.sum_lanes(weights, count, shares)
-        kept = 0
+        n_slots = 0
         for m in range(count):
             if shares[m] > ZERO:
-                shares[kept], slots[kept] = shares[m], pair[start + rows[m]] - base
-                kept += 1
-        cell_adjoint.record_means(shares, values, kept, y * across + x, slots, 0, records)
+                shares[n_slots], slots[n_slots] = shares[m], pair[start + rows[m]] - base
+                n_slots += 1
+        cell_adjoint.record_means(shares, values, n_slots, y * across + x, slots, 0, records)
 
 
 @kernel
 def _lift(
-    splats, shown, tile_starts, ranks, pair, pair_starts, values, counts, width, height, gate
+    splats, n_visible, tile_starts, ranks, pair, pair_starts, values, counts, width, height, gate
 ):
-    """Sums f32 [shown, E] of values [cells, E], E a multiple of 16, by rank; a cell whose count is
-    0 is passed over.
-    """
+    """Sums f32 [n_visible, E] by rank of values [cells, E], E in sixteens; count 0: left out."""
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     bands, room = len(pair_starts), 0
     for band in range(bands):
-        room = max(room, pair_starts[band, shown] - pair_starts[band, 0])
+        room = max(room, pair_starts[band, n_visible] - pair_starts[band, 0])
     records, sums = (
         np.empty((room, values.shape[1]), np.float32),
-        np.zeros((shown, values.shape[1]), np.float32),
+        np.zeros((n_visible, values.shape[1]), np.float32),
     )
     for band in range(bands):
         first_tile, base = band_start(band, rows) * columns, pair_starts[band, 0]
@@ -102,11 +97,12 @@ def _lift(
                 for k in range(tile_starts[tile], tile_starts[tile + 1]):
                     cell_adjoint.clear(records, pair[k] - base)
                 _lift_tile(
-                    splats, ranks, pair, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
-                    (tile // columns) * TILE, width, height, values, counts, gate, base, records,
+                    splats, ranks, pair, tile_starts[tile], tile_starts[tile + 1],
+                    (tile % columns) * TILE, (tile // columns) * TILE, width, height,
+                    values, counts, gate, base, records,
                 )  # fmt: skip
                 tile = claim(queue)
-        for m in prange(shown):
+        for m in prange(n_visible):
             for k in range(pair_starts[band, m] - base, pair_starts[band, m + 1] - base):
                 cell_adjoint.add_means(records, k, 0, sums, m)
     return sums
@@ -119,9 +115,7 @@ def binned(
     size: tuple[int, int],
     channels: np.ndarray | None = None,
 ) -> tuple[binning.Bins, np.ndarray]:
-    """The Gaussians that a view shows, by tile, and packed with their channels f32 [N, C];
-    arguments as of `lift`.
-    """
+    """The Gaussians that a view shows, by tile, and packed with channels f32 [N, C]; see `lift`."""
     means, quats, scales, opacities = gaussians
     camera = (np.ascontiguousarray(matrix, np.float64) for matrix in (viewmat, K))
     projected = ellipses.project(means, quats, scales, *camera, *size, NEAR, FAR, EPS2D)
@@ -142,7 +136,7 @@ def lift(
     counts: np.ndarray,
     gate: float = 0.0,
 ) -> Lifted:
-    """What the cells of one view say, summed by Gaussian: Σ w q b and Σ w q.
+    """Values of one view's cells, summed by Gaussian: Σ w q b and Σ w q.
 
     Args:
       gaussians: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], activated, float32.
@@ -168,17 +162,18 @@ def lift(
         )
     n_channels = values.shape[2]
     counted = counts > 0
-    said = np.zeros((*shape, int(cells.whole(n_channels + 1))), np.float32)
-    said[counted, :n_channels] = values[counted] * counts[counted][:, None]
-    said[counted, n_channels] = counts[counted]
-    if not (np.isfinite(said).all() and np.isfinite(counts).all()):
+    weighted = np.zeros((*shape, int(cells.whole(n_channels + 1))), np.float32)
+    weighted[counted, :n_channels] = values[counted] * counts[counted][:, None]
+    weighted[counted, n_channels] = counts[counted]
+    if not (np.isfinite(weighted).all() and np.isfinite(counts).all()):
         raise ValueError("a cell that counts holds a value that is not finite")
     bins, splats = binned(gaussians, viewmat, K, size)
     sums = _lift(
         splats, len(bins.order), bins.tile_starts, bins.rank, bins.pair, bins.pair_starts,
-        said.reshape(-1, said.shape[2]), counted.astype(np.float32), width, height, np.float32(gate),
+        weighted.reshape(-1, weighted.shape[2]), counted.astype(np.float32),
+        width, height, np.float32(gate),
     )  # fmt: skip
-    kept = np.flatnonzero(sums[:, n_channels] > 0)
-    kept = kept[np.argsort(bins.order[kept])]
-    chosen = sums[kept]
-    return Lifted(bins.order[kept], chosen[:, n_channels].copy(), chosen[:, :n_channels].copy())
+    rows = np.flatnonzero(sums[:, n_channels] > 0)
+    rows = rows[np.argsort(bins.order[rows])]
+    sums = sums[rows]
+    return Lifted(bins.order[rows], sums[:, n_channels].copy(), sums[:, :n_channels].copy())

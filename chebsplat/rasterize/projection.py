@@ -39,9 +39,7 @@ def is_antialiased(rasterize_mode: str) -> bool:
 
 
 def compensated(opacities: Tensor, compensations: Tensor) -> Tensor:
-    """Opacities [N] times compensations [N]; one that is not finite becomes 0, and gives neither a
-    gradient.
-    """
+    """Opacities [N] times compensations [N]; one that is not finite becomes 0, without gradient."""
     return torch.where(torch.isfinite(opacities), opacities, 0) * compensations
 
 
@@ -60,9 +58,8 @@ def project(
     Args: see `rasterize`; `viewmat` [4, 4], `K` [3, 3]; size: width and height; bounds: near and
       far plane.
     Choices: culled by `not (near < z < far)`, which rejects NaN too; the view ray's slope is
-      clamped to 1.3 times the
-    field of view in the Jacobian, as gsplat does; a zero quaternion or a non-finite result is
-    culled, never repaired.
+      clamped to 1.3 times the field of view in the Jacobian, as gsplat does; a zero quaternion or a
+      non-finite result is culled, never repaired.
     """
     (width, height), (near_plane, far_plane) = size, bounds
     camera = means @ viewmat[:3, :3].T + viewmat[:3, 3]
@@ -126,9 +123,7 @@ def project(
 
 
 def _ellipses(factor: Tensor, eps2d: float) -> tuple[Tensor, ...]:
-    """F Fᵀ of F [N, 2, 3]: xx, xy, yy without ε, the cross product of F's rows [N, 3], and det(F Fᵀ
-    + ε I).
-    """
+    """xx, xy, yy of F Fᵀ, the cross product [N, 3] of F's rows, det(F Fᵀ + ε I), of F [N, 2, 3]."""
     p1, p2 = factor.unbind(-2)
     a, b, c = (p1 * p1).sum(-1), (p1 * p2).sum(-1), (p2 * p2).sum(-1)
     # Cauchy-Binet: a sum of non-negative terms, where (a+ε)(c+ε) − b² cancels for needles.

@@ -1,10 +1,9 @@
-"""The oracle: plain torch, any float type, tile by tile, each tile a few matrix products; and
-`lift`'s, in float64.
+"""The oracle of rasterizing, in plain torch of any float type, and of `lift`, in float64.
 
-Within a tile, at an offset (x, y) from its middle, ln α of a Gaussian is a quadratic in x and y:
-six coefficients. So one matrix product gives ln α of all its pixels and Gaussians, and a second
-one, of compositing weights and colours, the image. Tiles with about as many Gaussians go together,
-filled up with ones that nobody sees.
+It goes tile by tile. At an offset (x, y) from a tile's middle, ln α of a Gaussian is a quadratic in
+x and y: six coefficients. So one matrix product gives ln α of all its pixels and Gaussians, and a
+second one, of compositing weights and colours, the image. Tiles with about as many Gaussians go
+together, filled up with invisible ones.
 """
 
 from __future__ import annotations
@@ -109,9 +108,7 @@ def rasterize(
 
 
 def with_cells(colors: Tensor, cell_colors: Tensor | None) -> Tensor:
-    """Both kinds of channels side by side, [N, D + E], or [C, N, D + E] if either is given by
-    view.
-    """
+    """Both kinds of channels side by side, [N, D + E], or [C, N, D + E] if either is by view."""
     if cell_colors is None:
         return colors
     shape = torch.broadcast_shapes(colors.shape[:-1], cell_colors.shape[:-1])
@@ -119,9 +116,7 @@ def with_cells(colors: Tensor, cell_colors: Tensor | None) -> Tensor:
 
 
 def cell_means(images: Tensor) -> Tensor:
-    """Means [C, ⌈H/4⌉, ⌈W/4⌉, E] of images [C, H, W, E] over cells of 4×4 pixels, cut off by the
-    image's edge.
-    """
+    """Means [C, ⌈H/4⌉, ⌈W/4⌉, E] of images [C, H, W, E] over cells of 4×4, cut at the edge."""
     means = torch.nn.functional.avg_pool2d(
         images.permute(0, 3, 1, 2), CELL, ceil_mode=True, count_include_pad=False
     )
@@ -134,19 +129,17 @@ def _refuse_broken(view: int, gradient: Tensor | None) -> None:
 
 
 def _composite(
-    means2d: Tensor, view: Projected, opacities: Tensor, channels: Tensor, width: int, height: int, max_alpha: float,
-    absolute: Tensor | None,
+    means2d: Tensor, view: Projected, opacities: Tensor, channels: Tensor, width: int, height: int,
+    max_alpha: float, absolute: Tensor | None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Render [H, W, D] and alpha [H, W, 1] of one view; backward also adds to `absolute` [N, 2] if
-    given, in place.
-    """
-    shown = (
+    """Render [H, W, D], alpha [H, W, 1] of one view; backward adds to `absolute` [N, 2], if any."""
+    visible = (
         view.visible
         & (opacities >= ALPHA_MIN)
         & torch.isfinite(opacities)
         & torch.isfinite(channels).all(-1)
     )
-    index = shown.nonzero()[:, 0]
+    index = visible.nonzero()[:, 0]
     index = index[torch.argsort(view.depths[index], stable=True)]
     columns, rows = math.ceil(width / TILE), math.ceil(height / TILE)
     table = torch.cat([means2d, view.whitening, opacities[:, None], channels], 1)[index]
@@ -191,8 +184,8 @@ def _composite(
 def _add_absolute(
     absolute: Tensor, shapes: Tensor, who: Tensor, x: Tensor, y: Tensor, gradient: Tensor
 ) -> None:
-    """Add Σ |∂L/∂mean| over pixels; gradient [T, TILE², M] to ln α, shapes [T, M, 5] of Gaussians
-    who [T, M] or −1.
+    """Add Σ |∂L/∂mean| over pixels to Gaussians who [T, M] (−1: none), from the gradient [T, TILE²,
+    M] to ln α and shapes [T, M, 5].
     """
     mean_x, mean_y, p, q, r = (t[:, None] for t in shapes.unbind(-1))
     dx, dy = x[:, None] - mean_x, y[:, None] - mean_y
@@ -205,8 +198,8 @@ def _add_absolute(
 def _pairs(
     table: Tensor, covariances: Tensor, columns: int, rows: int, width: int, height: int, side: int
 ) -> tuple[Tensor, Tensor]:
-    """Which of M Gaussians may reach 1/255 in which tile: indices [P] of both, tile by tile and in
-    order within.
+    """Pairs of M Gaussians and tiles where they may reach 1/255: indices [P] of both, by tile, in
+    order.
 
     Args: table [M, 6] means, whitening and opacities; covariances [M, 3].
     """
@@ -244,9 +237,7 @@ def _pairs(
 
 
 def _quadratics(offsets: Tensor, whitening: Tensor, log_opacities: Tensor) -> Tensor:
-    """Coefficients [P, 6] of ln α to 1, x, y, x², xy, y²; offsets [P, 2] of the means from the
-    middle of a tile.
-    """
+    """Coefficients [P, 6] of ln α to 1, x, y, x², xy, y²; offsets [P, 2] from tiles' middles."""
     p, q, r = whitening.unbind(-1)
     u, v = -(p * offsets[:, 0] + q * offsets[:, 1]), -r * offsets[:, 1]
     return -torch.stack(
@@ -273,8 +264,8 @@ def _batches(by_count: Tensor, counts: Tensor) -> list[Tensor]:
 
 
 class _Weights(torch.autograd.Function):
-    """Compositing weights α_i Π_{j<i} (1 − α_j) of depth-sorted Gaussians, the last dimension, of
-    ln α.
+    """Compositing weights α_i Π_{j<i} (1 − α_j) from ln α, Gaussians by depth in the last
+    dimension.
 
     Its adjoint is α_i T_i ∂w_i − α_i / (1 − α_i) Σ_{j>i} w_j ∂w_j: half the passes that autograd
     would make. Tests hold it to autograd.
@@ -314,9 +305,7 @@ def pixel_weights(
     size: tuple[int, int],
     max_alpha: float = 0.99,
 ) -> np.ndarray:
-    """Weights w = α T of every Gaussian at every pixel, f64 [H, W, N]; arguments as of
-    `lift.lift`.
-    """
+    """Weights w = α T of every Gaussian at every pixel, f64 [H, W, N]; arguments as `lift.lift`."""
     means, quats, scales, opacities = (
         torch.from_numpy(np.asarray(a, np.float64)) for a in gaussians
     )

@@ -5,9 +5,8 @@ all its cells at once, in chunks until every pixel is done, then sweeps cell by 
 repeats the sweep, so that only the cells' bit masks are kept between the two.
 
 Channels come in two kinds: `colors` by pixel, and `cell_colors`, of which only the mean over each
-  cell of 4×4 pixels is
-rendered. A Gaussian's part in that mean is the sum of its 16 weights, so a cell channel costs a
-sixteenth of the products of the other kind, forward and backward.
+cell of 4×4 pixels is rendered. A Gaussian's part in that mean is the sum of its 16 weights, so a
+cell channel costs a sixteenth of the products of the other kind, forward and backward.
 """
 
 from __future__ import annotations
@@ -28,15 +27,13 @@ CHUNK = 128  # Gaussians of a tile between two looks at whether it is done
 
 @inline
 def cell_column(channels):
-    """Where the cell channels of a splat begin: behind its shape, its channels and the 1 for
-    alpha.
-    """
+    """First column of a splat's cell channels, behind its shape, its channels and alpha's 1."""
     return cells.whole(SHAPE + channels + 1)
 
 
 @kernel
 def pack(order, means2d, whitening, opacities, colors, cell_colors):
-    """What the tiles read of each Gaussian, in rows of whole cache lines, front to back.
+    """Rows of whole cache lines that the tiles read, one for each Gaussian, front to back.
 
     Returns: splats [V + 1, S]: mean, whitening, log₂ opacity, two unused, the channels, a 1 for
       alpha, zeros, and from `cell_column` on the cell channels and zeros.
@@ -58,9 +55,7 @@ def pack(order, means2d, whitening, opacities, colors, cell_colors):
 
 @serial
 def fill_shapes(splats, ranks, start, n, left, top, shapes):
-    """Fill the tile's rows of shapes (see `cells`), and up to SLACK more, with the channels that
-    they have room for.
-    """
+    """Fill the tile's rows of shapes (see `cells`), up to SLACK more, with channels as they fit."""
     stop, step, depth = len(ranks) - 1, splats.shape[1], shapes.shape[1] - SHAPE
     for k in range(n):
         following = np.int64(ranks[min(start + k + AHEAD_OF_CACHE, stop)]) * step
@@ -81,18 +76,17 @@ def fill_shapes(splats, ranks, start, n, left, top, shapes):
 
 @serial
 def n_pixels_inside(cell, width, height):
-    """How many pixels of a cell lie in what is left of the image from its tile's corner on."""
+    """Pixels of a cell in an image that ends `width` × `height` pixels from its tile's corner."""
     x, y = 4 * (cell & 3), 4 * (cell >> 2)
     return max(min(4, width - x), 0) * max(min(4, height - y), 0)
 
 
 @serial
 def _forward_tile(
-    splats, ranks, start, stop, left, top, width, height, channels, max_alpha, masks, render, means, transmittance
+    splats, ranks, start, stop, left, top, width, height, channels, max_alpha, masks,
+    render, means, transmittance,
 ):  # fmt: skip
-    """One tile of `forward`, into flat render and transmittance. Returns how many of its pairs were
-    looked at.
-    """
+    """One tile of `forward`, into flat render and transmittance. Returns the pairs looked at."""
     states, depth = np.empty((LANES, 2, LANES), np.float32), cells.padded(channels)
     cells.begin(states, width - left, height - top)
     sums, column = np.zeros((LANES, depth, LANES), np.float32), cell_column(channels)
@@ -103,14 +97,14 @@ def _forward_tile(
     shapes = np.empty((CHUNK + SLACK, SHAPE + depth), np.float32)
     alphas, weights = np.empty((CHUNK, LANES), np.float32), np.empty((CHUNK, LANES), np.float32)
     hits, rows = np.empty(CHUNK + LANES, np.uint32), np.empty(CHUNK, np.uint32)
-    done, n_done, first = np.zeros(LANES, np.bool_), 0, start
+    is_done, n_done, first = np.zeros(LANES, np.bool_), 0, start
     while n_done < LANES and first < stop:
         n = min(CHUNK, stop - first)
         fill_shapes(splats, ranks, first, n, left, top, shapes)
         for k in range(n):
             masks[first + k] = cells.reach(shapes, k)
         for cell in range(LANES):
-            if done[cell]:
+            if is_done[cell]:
                 continue
             count = cells.listed(masks, first, n, cell, hits)
             count = cells.sweep(shapes, hits, count, cell, max_alpha, states, alphas, weights, rows)
@@ -121,8 +115,8 @@ def _forward_tile(
                     cells.accumulate_means(
                         splats, column, ranks, first, rows, shares, count, cell, mean_sums
                     )
-            done[cell] = cells.is_done(states, cell)
-            n_done += done[cell]
+            is_done[cell] = cells.is_done(states, cell)
+            n_done += is_done[cell]
         first += n
     pixels = np.empty(LANES * channels + LANES, np.float32)
     for cell in range(LANES):
@@ -166,8 +160,9 @@ def forward(splats, tile_starts, ranks, channels, cell_channels, width, height, 
         tile = claim(queue)
         while tile < n_tiles:
             used[tile] = _forward_tile(
-                splats, ranks, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
-                (tile // columns) * TILE, width, height, channels, max_alpha, masks, render, means, transmittance,
+                splats, ranks, tile_starts[tile], tile_starts[tile + 1],
+                (tile % columns) * TILE, (tile // columns) * TILE, width, height, channels,
+                max_alpha, masks, render, means, transmittance,
             )  # fmt: skip
             tile = claim(queue)
     shape = height, width

@@ -19,11 +19,10 @@ from chebsplat.rasterize.tiles import AHEAD_OF_CACHE, cell_column, fill_shapes, 
 
 @serial
 def _backward_tile(
-    splats, ranks, pair, masks, start, n, left, top, width, height, channels, max_alpha, grad, grad_means, grad_alpha,
-    absolute, base, spare, records,
+    splats, ranks, pair, masks, start, n, left, top, width, height, channels,
+    max_alpha, grad, grad_means, grad_alpha, absolute, base, spare, records,
 ):  # fmt: skip
-    """One tile of `backward`: adds to the records of its pairs. Returns whether the gradient is
-    finite.
+    """One tile of `backward`: adds to its pairs' records. Returns True for a finite gradient.
 
     `base` is the first pair's number, `spare` a row of records that takes what fills up a block.
     """
@@ -104,11 +103,10 @@ def _backward_tile(
 
 @kernel
 def backward(
-    n, splats, order, tile_starts, ranks, pair, pair_starts, masks, used, max_alpha, grad, grad_means, grad_alpha,
-    absolute,
+    n, splats, order, tile_starts, ranks, pair, pair_starts, masks, used, max_alpha,
+    grad, grad_means, grad_alpha, absolute,
 ):  # fmt: skip
-    """Gradients of n Gaussians, band by band, each Gaussian's records summed in the order of its
-    pairs.
+    """Gradients of n Gaussians, band by band, each Gaussian's records summed in order of its pairs.
 
     Args: masks, used as `forward` returned them; grad [H, W, D] of the render, grad_means [⌈H/4⌉,
       ⌈W/4⌉, E], grad_alpha [H, W]; absolute: whether to gather the absolute gradient too.
@@ -119,19 +117,22 @@ def backward(
     height, width, channels = grad.shape
     flat, flat_alpha = grad.reshape(-1), grad_alpha.reshape(-1)
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    finite, bands, shown = np.ones(len(tile_starts) - 1, np.bool_), len(pair_starts), len(order)
+    finite, bands, n_visible = np.ones(len(tile_starts) - 1, np.bool_), len(pair_starts), len(order)
     room = 0
     for band in range(bands):
         n_tiles = (band_start(band + 1, rows) - band_start(band, rows)) * columns
-        room = max(room, pair_starts[band, shown] - pair_starts[band, 0] + n_tiles)
+        room = max(room, pair_starts[band, n_visible] - pair_starts[band, 0] + n_tiles)
     cell_channels, column = grad_means.shape[2], N_GEOMETRY + cells.padded(channels)
     records = np.empty((room, column + cells.whole(cell_channels)), np.float32)
-    sums, to_colors = np.zeros((shown, N_GEOMETRY), np.float32), np.zeros((n, channels), np.float32)
+    sums, to_colors = (
+        np.zeros((n_visible, N_GEOMETRY), np.float32),
+        np.zeros((n, channels), np.float32),
+    )
     to_cell_colors = np.zeros((n, cells.whole(cell_channels)), np.float32)
     for band in range(bands):
         first_tile = band_start(band, rows) * columns
         n_tiles = band_start(band + 1, rows) * columns - first_tile
-        base, n_pairs = pair_starts[band, 0], pair_starts[band, shown] - pair_starts[band, 0]
+        base, n_pairs = pair_starts[band, 0], pair_starts[band, n_visible] - pair_starts[band, 0]
         queue = np.full(1, first_tile, np.int64)
         for _ in prange(WORKERS):
             tile = claim(queue)
@@ -139,13 +140,14 @@ def backward(
                 for k in range(tile_starts[tile], tile_starts[tile + 1]):
                     cell_adjoint.clear(records, pair[k] - base)
                 finite[tile] = _backward_tile(
-                    splats, ranks, pair, masks, tile_starts[tile], used[tile], (tile % columns) * TILE,
-                    (tile // columns) * TILE, width, height, channels, max_alpha, flat, grad_means, flat_alpha,
-                    absolute, base, n_pairs + tile - first_tile, records,
+                    splats, ranks, pair, masks, tile_starts[tile], used[tile],
+                    (tile % columns) * TILE, (tile // columns) * TILE, width, height, channels,
+                    max_alpha, flat, grad_means, flat_alpha, absolute, base,
+                    n_pairs + tile - first_tile, records,
                 )  # fmt: skip
                 tile = claim(queue)
-        for m in prange(shown):
-            following = np.int64(order[min(m + AHEAD_OF_CACHE, shown - 1)]) * channels
+        for m in prange(n_visible):
+            following = np.int64(order[min(m + AHEAD_OF_CACHE, n_visible - 1)]) * channels
             prefetch(to_colors, following)
             prefetch(to_colors, following + channels - 1)
             for k in range(pair_starts[band, m] - base, pair_starts[band, m + 1] - base):
@@ -159,7 +161,7 @@ def backward(
         np.zeros(n, np.float32),
         np.zeros((n if absolute else 0, 2), np.float32),
     )
-    for m in prange(shown):
+    for m in prange(n_visible):
         i, p, q, r = order[m], splats[m, 2], splats[m, 3], splats[m, 4]
         to_means2d[i, 0] = 2 * p * sums[m, 1]
         to_means2d[i, 1] = 2 * (q * sums[m, 1] + r * sums[m, 2])

@@ -53,13 +53,11 @@ def canonicalize(means: Tensor, scales: Tensor, rotmats: Tensor, mask: Tensor) -
 
 
 def metric_factors(region: Region, anisotropy: float) -> Tensor:
-    """Y_i = diag(sqrt(m_i)) R_iᵀ with m_ik = 1 / (1 + a (s_ik / s̃)²) (Eq 1); |Y_i Δ|² is the
-    squared length of Δ.
+    """Y_i = diag(sqrt(m_i)) R_iᵀ with m_ik = 1 / (1 + a (s_ik / s̃)²) (Eq 1): Δ has length |Y_i Δ|.
 
     Returns: [M, n, 3, 3].
     Choices: s̃ is the region's median largest scale, so that anisotropy does not fade with the
-      scene's units; a region
-    whose s̃ is 0 is isotropic wherever its scales are 0.
+      scene's units; a region whose s̃ is 0 is isotropic wherever its scales are 0.
     """
     largest = region.scales.amax(-1)
     typical = (
@@ -78,11 +76,11 @@ def metric_factors(region: Region, anisotropy: float) -> Tensor:
 
 @torch.no_grad()
 def tangent_axis(region: Region) -> tuple[Tensor, Tensor]:
-    """The axis of least variance of the region's Gaussian mixture, and how well it is defined.
+    """Axis of least variance of the region's Gaussian mixture, and the certainty of it.
 
     Returns: axis [M, 3], of arbitrary sign; certainty [M], a smoothstep of the gap of the two
-      smallest variances.
-      Neither has a gradient: that of an eigenvector does not exist where eigenvalues meet.
+      smallest variances. Neither has a gradient: that of an eigenvector does not exist where
+      eigenvalues meet.
     """
     widest = region.scales.amax((1, 2), keepdim=True).clamp_min(1.0)
     spread = region.rotmats * (region.scales / widest)[..., None, :]
@@ -115,17 +113,15 @@ def rotations_about(axis: Tensor, n_angles: int) -> Tensor:
 
 
 def similarity(region: Region, factors: Tensor, rotmats: Tensor, bandwidth: float) -> Tensor:
-    """S = A^-1/2 W A^-1/2, so that I − S is similar to the random-walk Laplacian of Eq 3: same
-    spectrum, symmetric.
+    """S = A^-1/2 W A^-1/2: I − S is symmetric, and similar to the random-walk Laplacian of Eq 3.
 
     Args:
       factors: [M, n, 3, 3], from `metric_factors`.
       rotmats: [M, 3, 3], the rotation of every metric of a region.
     Returns: [M, n, n], zero diagonal, zero rows for padding.
     Choices: degrees by logsumexp and one exponential of a difference of logarithms: a region all of
-      whose weights
-    underflow still has the right operator. Differences are formed directly, never by the expanded
-    square.
+      whose weights underflow still has the right operator. Differences are formed directly, never
+      by the expanded square.
     """
     delta = region.means[:, :, None] - region.means[:, None]
     turned = torch.einsum("mpqk,mkl->mpql", delta, rotmats)  # (rotmatᵀ Δ) in rows

@@ -1,13 +1,11 @@
-"""The symmetric operator u uᵀ − S of a region in float32 (Eqs 2-3): the fast twin of
-`albo.similarity`.
+"""The symmetric operator u uᵀ − S of a region in float32 (Eqs 2-3): fast twin of `albo.similarity`.
 
 S u = u for u_i = sqrt(A_i / Σ A). Without that pair the spectrum of a well connected region keeps
 off ±1, where T_d multiplies rounding errors by d² rather than by d.
 
 Matrices are [n, n] stored flat, where n is the member count filled up to a multiple of 16. All are
 symmetric: what fills one fills the blocks on and above the diagonal and mirrors them. Sums are
-  carried out as written: no function here
-may be compiled with reassociation.
+carried out as written: no function here may be compiled with reassociation.
 """
 
 from __future__ import annotations
@@ -77,9 +75,7 @@ def weights(points, factors, count, n, scale, out):
 
 @serial
 def column_sums(a, count, n, out):
-    """Sums of columns into out [n], what they lost to rounding into out [n:]: the true sum is their
-    difference.
-    """
+    """Column sums into out [n], and the excess of their rounding into out [n:]."""
     for j in range(0, n, 16):
         sums, lost = splat(ZERO), splat(ZERO)
         for i in range(count):
@@ -93,9 +89,7 @@ def column_sums(a, count, n, out):
 
 @serial
 def normalise(a, roots, u, count, n):
-    """a_ij <- u_i u_j − a_ij roots_i roots_j, of roots in two float32 each, [n] and [n:], rounded
-    once or nearly so.
-    """
+    """a_ij <- u_i u_j − a_ij roots_i roots_j, rounded about once; roots: two float32 each."""
     for i in range(count):
         root, rest, lead = splat(-roots[i]), splat(-roots[n + i]), splat(u[i])
         for j in range(0, n, 16):
@@ -108,9 +102,7 @@ def normalise(a, roots, u, count, n):
 
 @serial
 def operator(points, metrics, count, n, scale, split, degrees, u, out):
-    """u uᵀ − S into out [n, n], and u [n], unless a degree is too small for float32. Returns: the
-    least degree.
-    """
+    """u uᵀ − S into out [n, n], u [n], unless a degree is too small. Returns the least degree."""
     split[:] = ZERO
     for i in range(count):
         for k in range(3):

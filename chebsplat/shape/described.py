@@ -17,9 +17,7 @@ class Described(NamedTuple, Generic[Values]):
 
 @dataclass(frozen=True)
 class Descriptor:
-    """Numbers of a descriptor, as in `settings.DescribeSection`: J angles, D degrees, a, the
-    width.
-    """
+    """Parameters, as in `settings.DescribeSection`: J angles, D degrees, a, the bandwidth."""
 
     n_angles: int = 8
     max_degree: int = 8

@@ -1,8 +1,7 @@
 """Chebyshev descriptors of regions of Gaussians (Eqs 4-6).
 
 Two backends agree to float32: `numba` is compiled, `reference` (torch) differentiable. Torch is
-  imported where it is
-needed only: finished scenes are described without it.
+imported where it is needed only: finished scenes are described without it.
 """
 
 from __future__ import annotations
@@ -28,20 +27,19 @@ def describe(
     scales: Tensor,
     rotmats: Tensor,
     mask: Tensor,
-    wanted: Descriptor = DEFAULT,
+    parameters: Descriptor = DEFAULT,
     *,
     dtype: torch.dtype | None = None,
     backend: Literal["auto", "numba", "reference"] = "auto",
 ) -> Described[Tensor]:
-    """Descriptor of every Gaussian of every region: g^d(i) = n ([T_d(−S)]_ii − T_d(0)), by angle
-    and degree.
+    """Descriptor g^d(i) = n ([T_d(−S)]_ii − T_d(0)) of every Gaussian of every region, by angle,
+    degree.
 
     Args:
       means, scales, rotmats, mask: [M, n, ...], as `albo.canonicalize`.
       dtype:   of the result, float32 if None; float64 by the reference only.
       backend: `numba` (float32, no gradient; the same bits for any number of threads), `reference`,
-        or
-        `auto`: numba where it can.
+        or `auto`: numba where it can.
     Returns: values [M, n, J, P], zero where padded and in regions of fewer than two Gaussians,
       which have no edge. Of the full spectrum it is the printed formula with K = n and λ_max = 2,
       without degrees 0 and 1, which vanish.
@@ -49,7 +47,7 @@ def describe(
     """
     import torch
 
-    w = wanted
+    w = parameters
     if w.n_angles < 1 or w.max_degree < 2 or not w.bandwidth > 0 or not w.anisotropy >= 0:
         raise ValueError(
             "n_angles >= 1, max_degree >= 2, bandwidth > 0 and anisotropy >= 0 are needed"
@@ -68,7 +66,7 @@ def describe(
     if backend == "reference" or (backend == "auto" and not can_compile):
         from chebsplat.shape import descriptor_reference
 
-        return Described(descriptor_reference.describe(*regions, wanted, dtype=dtype))
+        return Described(descriptor_reference.describe(*regions, parameters, dtype=dtype))
     if backend not in ("auto", "numba"):
         raise ValueError(f"backend {backend!r} is none of auto, numba, reference")
     if not can_compile:
@@ -89,8 +87,7 @@ def describe_members(
     *,
     chunk: int = 2048,
 ) -> Described[np.ndarray]:
-    """Descriptors f32 [M, n, J, P] of regions whose members are gathered from Gaussians; without
-    torch.
+    """Descriptors f32 [M, n, J, P] of regions of Gaussians given by their members; without torch.
 
     Args:
       means:   [N, 3] scene units; quats [N, 4] wxyz, of any length; scales [N, 3] standard

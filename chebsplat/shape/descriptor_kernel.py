@@ -47,9 +47,7 @@ def next_term(x, term, before, at_zero, count, n, out):
 
 @serial
 def row_products(a, b, count, n, out, start):
-    """Diagonal of a b into out[start:]; columns are summed, which for symmetric matrices are the
-    rows.
-    """
+    """Diagonal of a b into out[start:], by columns, which are rows of a symmetric matrix."""
     for j in range(0, n, 16):
         sums = splat(ZERO)
         for i in range(count):
@@ -87,8 +85,8 @@ def diagonals(terms, u, max_degree, count, n, out):
 
 @serial
 def pair_angles(values, certainty, index, count, n, out):
-    """Replace angles j and J − j by half their sum and difference, faded by certainty, into out
-    [slots, J, D - 1].
+    """Half the sum and difference of angles j and J − j, faded by certainty, into out [slots, J, D
+    - 1].
 
     Args: values [J, (D - 1) n], only the first angle filled where certainty is 0.
     """
@@ -158,8 +156,7 @@ def describe_block(first, last, means, scales, rotmats, mask, anisotropy, bandwi
 
 @kernel
 def describe(means, scales, rotmats, mask, anisotropy, bandwidth, out, exact):
-    """Descriptors of regions into out f32 [M, n, J, D - 1], and into exact [M] which took the
-    float64 operator.
+    """Descriptors of regions into out f32 [M, n, J, D - 1]; exact [M]: took the float64 operator.
 
     Args: float64 means, scales [M, n, 3], rotmats [M, n, 3, 3]; mask [M, n] bool; out and exact
       zero.

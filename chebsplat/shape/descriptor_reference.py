@@ -21,8 +21,8 @@ def chebyshev_diagonals(S: Tensor, max_degree: int) -> Tensor:
     Args: S [..., n, n] symmetric, spectrum within [-1, 1], zero diagonal.
     Returns: [..., n, max_degree - 1].
     Choices: E_m = T_m − T_m(0) I is carried, so nothing of size 1 is ever subtracted; the diagonals
-      of T_2m and
-    T_2m+1 are row products of T_m and T_m+1, so max_degree 8 costs three matrix products.
+      of T_2m and T_2m+1 are row products of T_m and T_m+1, so max_degree 8 costs three matrix
+      products.
     """
     x = -S
     terms = [torch.zeros_like(x), x]
@@ -44,7 +44,7 @@ def describe(
     scales: Tensor,
     rotmats: Tensor,
     mask: Tensor,
-    wanted: Descriptor,
+    parameters: Descriptor,
     *,
     dtype: torch.dtype,
 ) -> Tensor:
@@ -52,18 +52,17 @@ def describe(
     float64.
 
     Choices: angles j and J − j are replaced by half their sum and half their absolute difference,
-      so that the sign of
-    the axis does not matter; angles j > 0 fade to angle 0 where the axis is ill-defined; the axis
-    has no gradient.
+      so that the sign of the axis does not matter; angles j > 0 fade to angle 0 where the axis is
+      ill-defined; the axis has no gradient.
     """
-    region, n_angles = canonicalize(means, scales, rotmats, mask), wanted.n_angles
-    factors = metric_factors(region, wanted.anisotropy)
+    region, n_angles = canonicalize(means, scales, rotmats, mask), parameters.n_angles
+    factors = metric_factors(region, parameters.anisotropy)
     around, certainty = tangent_axis(region)
     count = region.mask.sum(1)[:, None, None]
     angles = []
     for rotation in rotations_about(around, n_angles):
-        S = similarity(region, factors, rotation, wanted.bandwidth)
-        angles.append(chebyshev_diagonals(S.to(dtype), wanted.max_degree) * count)
+        S = similarity(region, factors, rotation, parameters.bandwidth)
+        angles.append(chebyshev_diagonals(S.to(dtype), parameters.max_degree) * count)
     certainty = certainty.to(dtype)[:, None, None]
     keep = region.mask[..., None, None] & (count[..., None] > 1)
     paired = angles[:1]

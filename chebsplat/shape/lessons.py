@@ -1,4 +1,4 @@
-"""What scenes teach about shape, in closed form: sums over a scene's points, and the map from shape
+"""Lessons of scenes about shape, in closed form: sums over a scene's points, and the map from shape
 to meaning that many scenes' sums give. They commute, so that no scene is forgotten and no order
 matters (docs/method.md, section 14).
 """
@@ -32,9 +32,7 @@ class Sums(NamedTuple):
     square: float
 
     def spread(self) -> float:
-        """σ_f = √(Σ w |y − ȳ|²) of the meanings (Eq 15); the last feature is 1, so that the last
-        row of b is ȳ.
-        """
+        """σ_f = √(Σ w |y − ȳ|²) of the meanings (Eq 15); z ends in 1, so b's last row is ȳ."""
         return float(np.sqrt(max(self.square - float(self.cross[-1] @ self.cross[-1]), 0.0)))
 
 
@@ -52,17 +50,17 @@ def summed(features: np.ndarray, meanings: np.ndarray, weights: np.ndarray) -> S
 
 
 def odds(n_views: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """How much each of N points teaches, f64 [N], sum 1: half alike, half by 1 / sqrt(frequency of
-    its label).
+    """Weight of each of N points in a lesson, f64 [N], sum 1: half alike, half by 1 /
+    sqrt(frequency of its label).
 
     Args: n_views [N], that see it; labels [N] that its teacher gives it.
     Raises: DataFailure where none is seen in LEAST_VIEWS views.
     """
-    seen = (n_views >= LEAST_VIEWS).astype(np.float64)
-    if not seen.any():
+    visible = (n_views >= LEAST_VIEWS).astype(np.float64)
+    if not visible.any():
         raise DataFailure(f"no point is seen in {LEAST_VIEWS} views")
-    rare = seen / np.sqrt(np.maximum(np.bincount(labels, seen), 1)[labels])
-    return np.asarray(0.5 * seen / seen.sum() + 0.5 * rare / rare.sum())
+    rare = visible / np.sqrt(np.maximum(np.bincount(labels, visible), 1)[labels])
+    return np.asarray(0.5 * visible / visible.sum() + 0.5 * rare / rare.sum())
 
 
 def combined(sums: Sequence[Sums], weights: Sequence[float]) -> Sums:
@@ -85,7 +83,7 @@ def mean_of(sums: Sequence[Sums]) -> Sums:
 
 
 def alive(diagonal: np.ndarray) -> np.ndarray:
-    """Which features are not zero everywhere, bool [p], by diag A [p]."""
+    """True for features that are not zero everywhere, bool [p], by diag A [p]."""
     return np.asarray(diagonal > ZERO * diagonal.max())
 
 
@@ -98,8 +96,8 @@ def solved(sums: Sums, ridge: float) -> np.ndarray:
     used = alive(diagonal)
     scale = 1 / np.sqrt(np.where(used, diagonal, 1))
     correlation = sums.gram * scale[:, None] * scale + np.diag(np.where(used, ridge, 1.0))
-    found = cho_solve(cho_factor(correlation, lower=True), sums.cross * scale[:, None])
-    return np.asarray(found * (scale * used)[:, None])
+    scaled = cho_solve(cho_factor(correlation, lower=True), sums.cross * scale[:, None])
+    return np.asarray(scaled * (scale * used)[:, None])
 
 
 def unexplained(sums: Sums, answers: np.ndarray) -> float:
@@ -135,13 +133,13 @@ def basis(sums: Sums, scale: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(vectors[:, ::-1][:, : int(np.searchsorted(share, ENERGY)) + 1])
 
 
-def novelty(sums: Sums, scale: np.ndarray, known: np.ndarray) -> float:
+def novelty(sums: Sums, scale: np.ndarray, B: np.ndarray) -> float:
     """ρ = √(share of a scene's energy that lies outside B) in [0, 1] (Eq 15).
 
-    Args: sums: of the scene; scale [p]: that B was made with; known [p, r]: B, by `basis`.
+    Args: sums: of the scene; scale [p]: that B was made with; B [p, r]: by `basis`.
     """
     correlation = sums.gram * scale[:, None] * scale
-    inside = float(np.sum(known * (correlation @ known)))
+    inside = float(np.sum(B * (correlation @ B)))
     return float(np.sqrt(np.clip(1 - inside / np.trace(correlation), 0, 1)))
 
 

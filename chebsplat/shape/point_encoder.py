@@ -1,8 +1,8 @@
-"""The point encoder: what surrounds a point at several radii in, features of its shape out (Eq 7).
+"""The point encoder: a point's surroundings at several radii in, features of its shape out (Eq 7).
 
-It sees geometry alone and is taught (`taught`) once, over many rooms, so that it cannot repeat what
-a 2D teacher gets wrong for reasons of texture or of view. From then on it stays as it is: what its
-features mean, scenes teach by sums (`shape.lessons`; docs/method.md, section 14).
+It sees geometry alone and is trained once (`train_encoder`), over many rooms, so that it cannot
+repeat what a 2D teacher gets wrong for reasons of texture or of view. From then on it stays as it
+is: what its features mean, scenes teach by sums (`shape.lessons`; docs/method.md, section 14).
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Scale(nn.Module):
     Choices: a neighbour's token is f(G_i) + PE(c_i): its embedding and the point's own, and where
       it lies. One block, normalised before; only the learned token is read of its attention, so
       that one query a head asks every point, and keys and values need no matrix a neighbour. Where
-      a radius holds nobody the token attends to itself alone. Without attention, to measure it by,
+      a radius is empty the token attends to itself alone. Without attention, to measure it by,
       the largest of the tokens stands in the learned one's place.
     """
 
@@ -90,27 +90,25 @@ class Scale(nn.Module):
         self.value, self.out = (nn.Linear(hidden, hidden, bias=False) for _ in range(2))
         self.feed = nn.Sequential(nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, hidden))
 
-    def asked(self) -> Tensor:
+    def project_query(self) -> Tensor:
         """[h, heads]: W_kᵀ of each head's part of the learned token's query, over √(h / heads)."""
         query = self.query(self.norm(self.token)).reshape(N_HEADS, -1)
         keys = self.key.weight.reshape(N_HEADS, -1, self.key.in_features)
-        asked: Tensor = torch.einsum("hq,hqd->dh", query, keys) / query.shape[1] ** 0.5
-        return asked
+        projected: Tensor = torch.einsum("hq,hqd->dh", query, keys) / query.shape[1] ** 0.5
+        return projected
 
-    def answered(self) -> Tensor:
-        """[heads, h, h]: from what each head has gathered of tokens to what it adds to the learned
-        one, W_o W_v.
-        """
+    def project_values(self) -> Tensor:
+        """[heads, h, h], W_o W_v: from the tokens that a head gathers to its part of the output."""
         values = self.value.weight.reshape(N_HEADS, -1, self.value.in_features)
         out = self.out.weight.reshape(self.out.out_features, N_HEADS, -1)
-        answered: Tensor = torch.einsum("hqd,ohq->hdo", values, out)
-        return answered
+        projected: Tensor = torch.einsum("hqd,ohq->hdo", values, out)
+        return projected
 
     def forward(
         self, embedded: Tensor, centers: Tensor, neighbors: Tensor, relative: Tensor
     ) -> Tensor:
-        """embedded [U, width], centers [B], neighbors [B, K] rows of it, -1: none; relative [B, K,
-        10] -> [B, 2 h].
+        """embedded [U, width] and its rows centers [B] and neighbors [B, K], -1: none, with
+        relative [B, K, 10] -> [B, 2 h].
         """
         present, rows = neighbors >= 0, neighbors.clamp_min(0)
         tokens = (
@@ -124,17 +122,19 @@ class Scale(nn.Module):
             largest = fed.masked_fill(~present[..., None], -1e9).amax(1)
             return torch.cat([torch.where(present.any(1, keepdim=True), largest, 0.0), mean], 1)
         normal, own = self.norm(tokens), self.norm(self.token)
-        scores = (normal @ self.asked()).masked_fill(~present[..., None], -math.inf)
-        scores = torch.cat([scores, (own @ self.asked()).expand(len(scores), 1, -1)], 1).softmax(1)
+        scores = (normal @ self.project_query()).masked_fill(~present[..., None], -math.inf)
+        scores = torch.cat(
+            [scores, (own @ self.project_query()).expand(len(scores), 1, -1)], 1
+        ).softmax(1)
         # [B, heads, h]
         gathered = scores[:, :-1].transpose(1, 2) @ normal + scores[:, -1, :, None] * own
-        token = self.token + torch.einsum("bhd,hdo->bo", gathered, self.answered())
+        token = self.token + torch.einsum("bhd,hdo->bo", gathered, self.project_values())
         token = token + self.feed(self.norm_after(token))
         return torch.cat([token, mean], 1)
 
 
 class PointEncoder(nn.Module):
-    """Features z of a point's shape, and while it is taught, what a teacher says of such a point.
+    """Features z of a point's shape and, in training, a teacher's features of such a point.
 
     Args:
       n_descriptors: values of a point's descriptors over all radii; 0: it sees none.
@@ -195,9 +195,9 @@ class PointEncoder(nn.Module):
         standard = self.norm_descriptors(descriptors).double()
         values, axes = torch.linalg.eigh(standard.T @ standard / len(standard))
         count = self.settings["n_components"]
-        kept = axes.flip(1)[:, :count] / values.flip(0)[:count].clamp_min(1e-6).sqrt()
-        signs = torch.where(kept.gather(0, kept.abs().argmax(0)[None]) < 0, -1.0, 1.0)
-        self.components.copy_(kept * signs)
+        directions = axes.flip(1)[:, :count] / values.flip(0)[:count].clamp_min(1e-6).sqrt()
+        signs = torch.where(directions.gather(0, directions.abs().argmax(0)[None]) < 0, -1.0, 1.0)
+        self.components.copy_(directions * signs)
 
     def embedded(self, own: Tensor, descriptors: Tensor) -> Tensor:
         """[U, width] of points by themselves."""
@@ -208,32 +208,30 @@ class PointEncoder(nn.Module):
         return embedded
 
     def forward(self, cloud: Cloud, embedded: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
-        """z [B, p] for rows `centers` [B]; `neighbors` [B, S, K] are rows of cloud and of embedded
-        [U, width].
-        """
+        """z [B, p] for rows `centers` [B]; `neighbors` [B, S, K]: rows of cloud and `embedded`."""
         parts = [embedded[centers]]
         for index, scale in enumerate(self.scales):
             rows = neighbors[:, index]
             parts.append(
                 scale(embedded, centers, rows, relative(cloud, centers, rows, RADII[index]))
             )
-        seen = torch.cat(parts, 1)
-        return torch.cat([seen, self.decode(seen), torch.ones(len(seen), 1)], 1)
+        features = torch.cat(parts, 1)
+        return torch.cat([features, self.decode(features), torch.ones(len(features), 1)], 1)
 
     def answers(self, features: Tensor) -> Tensor:
-        """What the teacher that it was taught by says of points with features z [B, p]: [B, C]."""
-        said: Tensor = self.head(features[:, -1 - self.head.in_features : -1])
-        return said
+        """Features [B, C] that the encoder's teacher gives points with features z [B, p]."""
+        answer: Tensor = self.head(features[:, -1 - self.head.in_features : -1])
+        return answer
 
     @torch.no_grad()
     def encode(self, inputs: PointInputs, rows: np.ndarray | None = None) -> np.ndarray:
         """z f32 [N, p] of these points, all by default."""
         cloud = cloud_of(inputs)
-        wanted = torch.arange(len(cloud.own)) if rows is None else torch.from_numpy(rows)
+        centers = torch.arange(len(cloud.own)) if rows is None else torch.from_numpy(rows)
         embedded = self.embedded(cloud.own, cloud.descriptors)
         parts = [torch.zeros(0, self.n_features)]
         parts += [
-            self(cloud, embedded, some, cloud.neighbors[some]) for some in wanted.split(CHUNK)
+            self(cloud, embedded, some, cloud.neighbors[some]) for some in centers.split(CHUNK)
         ]
         return torch.cat(parts).numpy()
 
@@ -252,14 +250,14 @@ class PointEncoder(nn.Module):
 
 
 def relative(cloud: Cloud, centers: Tensor, neighbors: Tensor, radius: float) -> Tensor:
-    """How neighbours [B, K] lie about points [B], in radii: [B, K, N_RELATIVE].
+    """Places of neighbours [B, K] about points [B], in radii: [B, K, N_RELATIVE].
 
     Args: neighbors: rows of the cloud; -1 is none, whose values mean nothing; radius: metres.
 
     Choices: the offset itself, its length, its length in the horizontal and its height's size;
       along the point's normal and across it; the product of both normals, and the difference of
       normal · up. Teaching turns rooms about the vertical, so that the offset's direction there
-      says nothing.
+      is random.
     """
     rows = neighbors.clamp_min(0)
     offset = (cloud.means[rows] - cloud.means[centers][:, None]) / radius
@@ -293,7 +291,7 @@ class Example:
 
 @dataclass(frozen=True)
 class Course:
-    """How the encoder is taught."""
+    """Settings of the encoder's training."""
 
     steps: int = 3000
     batch: int = 640
@@ -303,9 +301,10 @@ class Course:
     seed: int = 0
 
 
-def taught(encoder: PointEncoder, examples: list[Example], course: Course) -> Iterator[float]:
-    """Train in place; yields the loss of each step, the mean length of the difference to the
-    teacher's mean features.
+def train_encoder(
+    encoder: PointEncoder, examples: list[Example], course: Course
+) -> Iterator[float]:
+    """Train in place; yields the loss of each step, the mean distance to a teacher's mean features.
 
     Choices: one room a step, turned about the vertical and mirrored at random. AdamW, half a
       cosine.
@@ -320,8 +319,8 @@ def taught(encoder: PointEncoder, examples: list[Example], course: Course) -> It
         index = int(rng.integers(len(examples)))
         example = examples[index]
         rows = torch.from_numpy(rng.choice(len(drawn[index]), course.batch, p=drawn[index]))
-        chosen = np.sort(rng.permutation(example.cloud.neighbors.shape[2])[: course.n_neighbors])
-        part, centers, neighbors = excerpt(example.cloud, rows, torch.from_numpy(chosen))
+        columns = np.sort(rng.permutation(example.cloud.neighbors.shape[2])[: course.n_neighbors])
+        part, centers, neighbors = excerpt(example.cloud, rows, torch.from_numpy(columns))
         part = turned(part, rng.uniform(0, 2 * math.pi), mirrored=bool(rng.random() < 0.5))
         answers = encoder.answers(
             encoder(part, encoder.embedded(part.own, part.descriptors), centers, neighbors)
@@ -333,13 +332,13 @@ def taught(encoder: PointEncoder, examples: list[Example], course: Course) -> It
         yield float(loss.detach())
 
 
-def excerpt(cloud: Cloud, rows: Tensor, chosen: Tensor) -> tuple[Cloud, Tensor, Tensor]:
-    """The points `rows` [B] and their neighbours in columns `chosen` [k], each once.
+def excerpt(cloud: Cloud, rows: Tensor, columns: Tensor) -> tuple[Cloud, Tensor, Tensor]:
+    """The points `rows` [B] and their neighbours in `columns` [k], each once.
 
     Returns: the cloud of these; which of its rows the points are [B]; and their neighbours,
              rows of it too, [B, S, k], -1 none.
     """
-    neighbors = cloud.neighbors[rows][:, :, chosen]
+    neighbors = cloud.neighbors[rows][:, :, columns]
     present = neighbors >= 0
     distinct, inverse = torch.cat([rows, neighbors[present]]).unique(return_inverse=True)
     renumbered = torch.full_like(neighbors, -1)

@@ -1,6 +1,4 @@
-"""What the point encoder sees of a cloud of points: shape at several radii, and nothing of what it
-looks like.
-"""
+"""Inputs of the point encoder: shape of a cloud of points at several radii, without appearance."""
 
 from __future__ import annotations
 
@@ -30,9 +28,8 @@ class PointInputs(NamedTuple):
     """Of N points, in metres, z up; S radii.
 
     own:         f32 [N, 6]: height above the floor; normal · up and its size; standard deviations
-      along the least and
-                 the middle axis of the local covariance over that along the largest; logarithm of
-                 that.
+      along the least and the middle axis of the local covariance over that along the largest;
+      logarithm of that.
     means:       f32 [N, 3] about their centroid; normals: f32 [N, 3].
     descriptors: f32 [N, S J P], of the point itself in a region about it, by radius.
     neighbors:   i32 [N, S, K] rows of points, -1 where a radius holds fewer.
@@ -67,11 +64,9 @@ def point_inputs(
     Raises: ValueError on values that are not finite, or no unit at all.
     Choices: a neighbourhood of radius r is of points of which a cube of edge 0.36 r keeps one, so
       that K of them reach as far as r however dense the cloud is; the nearest K to 1.3 r are taken.
-      Descriptors are of the point itself in
-      the region of its 31 nearest of these: Eq 9 is exact at a region's centre. Covariances only
-        shape the metric and
-      three ratios, so that their scale must be that of the spacing
-      (`splats.gaussians.local_shape`).
+      Descriptors are of the point itself in the region of its 31 nearest of these: Eq 9 is exact at
+      a region's centre. Covariances only shape the metric and three ratios, so that their scale
+      must be that of the spacing (`splats.gaussians.local_shape`).
     """
     if not unit > 0 or not all(np.isfinite(v).all() for v in (means, normals, covariances, up)):
         raise ValueError(
@@ -110,7 +105,7 @@ def truncation(
     N_TRIED points, and between these points' descriptors of twice as many degrees.
 
     Args: as for `point_inputs`. Returns: in [0, 2]; None where fewer than 3 points, or only points
-      of one shape, are there to be told apart.
+      of one shape, are there.
     Choices: at the radius of middle size; points evenly through their order, which needs no seed.
     """
     rows = np.unique(np.linspace(0, len(means) - 1, min(N_TRIED, len(means))).round().astype(int))
@@ -163,9 +158,9 @@ def _regions(
     if len(rows):
         sample = first_of_each(means, SPACING * radius)
         count = min(MEMBERS, len(sample))
-        found, index = cKDTree(means[sample]).query(means[rows], count, workers=-1)
+        lengths, index = cKDTree(means[sample]).query(means[rows], count, workers=-1)
         near[:, :count] = sample[index.reshape(len(rows), count)]
-        distance[:, :count] = found.reshape(len(rows), count)
+        distance[:, :count] = lengths.reshape(len(rows), count)
     others = np.where((near == own) | (distance > 2 * radius), -1, near)
     order = np.argsort(others < 0, axis=1, kind="stable")
     return (

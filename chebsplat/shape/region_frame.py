@@ -64,25 +64,21 @@ def canonical(means, scales, rotmats, mask, index, points, sizes, frames):
 
 @serial
 def lower_median(values, count):
-    """The ((count + 1) // 2)-th smallest of values[:count], by ranks: `numpy.sort` takes a second
-    to compile.
-    """
-    wanted = (count - 1) // 2
+    """Lower median of values[:count], by ranks: `numpy.sort` takes a second to compile."""
+    middle = (count - 1) // 2
     for i in range(count):
         rank = 0
         for j in range(count):
             if values[j] < values[i] or (values[j] == values[i] and j < i):
                 rank += 1
-        if rank == wanted:
+        if rank == middle:
             return values[i]
     return 0.0
 
 
 @serial
 def metric(sizes, frames, count, anisotropy, largest, factors):
-    """Y_i = diag(sqrt(m_i)) R_iᵀ of each member into factors [count, 3, 3]; `largest` [n] is
-    scratch.
-    """
+    """Y_i = diag(sqrt(m_i)) R_iᵀ of each member into factors [count, 3, 3]; `largest`: scratch."""
     for i in range(count):
         largest[i] = max(sizes[i, 0], sizes[i, 1], sizes[i, 2])
     typical = lower_median(largest, count)
@@ -99,9 +95,7 @@ def metric(sizes, frames, count, anisotropy, largest, factors):
 
 @serial
 def eigen(a, vectors):
-    """Eigenvalues of the symmetric a [3, 3] onto its diagonal, eigenvectors into the columns, by
-    Jacobi's rotations.
-    """
+    """Eigenvalues of a symmetric a [3, 3] onto its diagonal, eigenvectors into columns (Jacobi)."""
     for i in range(3):
         for j in range(3):
             vectors[i, j] = 1.0 if i == j else 0.0
@@ -131,9 +125,7 @@ def eigen(a, vectors):
 
 @serial
 def tangent_axis(points, sizes, frames, count, axis):
-    """Least-variance axis of the region's Gaussian mixture, into `axis` [3]; returns its certainty
-    in [0, 1].
-    """
+    """Least-variance axis of the region's mixture into `axis` [3]; returns its certainty."""
     widest = 1.0
     for i in range(count):
         widest = max(widest, sizes[i, 0], sizes[i, 1], sizes[i, 2])
@@ -167,9 +159,7 @@ def tangent_axis(points, sizes, frames, count, axis):
 
 @serial
 def turn_back(points, count, axis, angle, turned):
-    """Rotᵀ c of each point, Rot by `angle` about `axis`: turning every metric is turning the
-    centres back.
-    """
+    """Rotᵀ c of each point, Rot by `angle` about `axis`: as if Rot turned every metric."""
     sin, cos = math.sin(-angle), 1.0 - math.cos(angle)
     x, y, z = axis[0], axis[1], axis[2]
     for i in range(count):

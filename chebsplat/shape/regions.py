@@ -10,15 +10,14 @@ from scipy.spatial import cKDTree
 
 from chebsplat.settings import DescribeSection
 
-SAMPLE = 65536  # points that stand for all where only a density is wanted
+SAMPLE = 65536  # points that stand for all in estimates of density
 
 
 class Regions(NamedTuple):
     """centers i64 [M] are indices of points, in farthest-point order; members i64 [M, n], -1 where
-    padded, the centre
-    first. radius: scene units; no member is farther from its centre, and it is at least the
-      centres' covering
-    radius. share: the part of all points that members were taken from.
+    padded, the centre first. radius: scene units; no member is farther from its centre, and it is
+    at least the centres' covering radius. share: the part of all points that members were taken
+    from.
     """
 
     centers: np.ndarray
@@ -62,8 +61,8 @@ def farthest_points(means: np.ndarray, count: int, start: int) -> tuple[np.ndarr
     """Indices [M] of points, each the farthest from those before it, and their covering radius.
 
     Choices: M < count where only coincident points are left. Exact in float32 around the centroid.
-      `start` is an
-    index in the library's own order of the points: it seeds the first pick without naming it.
+      `start` is an index in the library's own order of the points: it seeds the first pick without
+      naming it.
     """
     n = len(means)
     if n == 1:
@@ -72,8 +71,10 @@ def farthest_points(means: np.ndarray, count: int, start: int) -> tuple[np.ndarr
     extent = float(np.abs(points).max())
     points = np.ascontiguousarray(points / (extent or 1.0), np.float32)
     height = int(np.clip(np.log2(n) - 4, 1, 9))
-    asked = min(count + 1, n)  # one more: its distance is the covering radius
-    picked = np.asarray(fpsample.bucket_fps_kdline_sampling(points, asked, height, start), np.int64)
+    n_picks = min(count + 1, n)  # one more: its distance is the covering radius
+    picked = np.asarray(
+        fpsample.bucket_fps_kdline_sampling(points, n_picks, height, start), np.int64
+    )
     _, first = np.unique(points[picked], axis=0, return_index=True)
     picked = picked[np.sort(first)]
     centers = picked[:count]
@@ -103,9 +104,7 @@ def _neighbourhoods(
     region_size: int,
     keys: np.ndarray,
 ) -> np.ndarray:
-    """members i64 [M, region_size]: the centre, then the nearest of the thinned points within the
-    radius.
-    """
+    """members i64 [M, region_size]: the centre, then the nearest thinned points in the radius."""
     thinned = np.flatnonzero(keys < share)
     where = means[centers]
     k = min(region_size, max(len(thinned), 1))
@@ -126,9 +125,7 @@ def _tree(points: np.ndarray) -> cKDTree:
 
 
 def _uniform(ids: np.ndarray, seed: int) -> np.ndarray:
-    """A number in [0, 1) for each id and seed, by a mixing of bits in which every one reaches every
-    other.
-    """
+    """A number in [0, 1) for each id and seed, by mixing all their bits."""
     x = np.asarray(ids, np.uint64) + np.uint64(1 + (seed << 32) % 2**63)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)

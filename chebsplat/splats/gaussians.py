@@ -1,5 +1,4 @@
-"""Gaussian parameters: from points with local shape to raw parameters, and from raw to activated
-values.
+"""Gaussian parameters: from points with local shape to raw ones, from raw to activated values.
 
 Rows chosen by an index have a cheap gradient.
 """
@@ -83,9 +82,7 @@ def sh0_of(colors: np.ndarray) -> np.ndarray:
 
 
 def activated(raw: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(means [N, 3], quats [N, 4], scales [N, 3] > 0, opacities [N] in (0, 1)) of raw
-    parameters.
-    """
+    """means [N, 3], quats [N, 4], scales [N, 3] > 0, opacities [N] in (0, 1) of raw parameters."""
     return raw["means"], raw["quats"], raw["log_scales"].exp(), raw["logit_opacities"].sigmoid()
 
 
@@ -96,8 +93,7 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
 
 
 def surface_of(parameters: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Normals f32 [N, 3], unit and of any sign, and colours f32 [N, 3] in [0, 1], of raw
-    parameters.
+    """Normals f32 [N, 3], unit, of any sign, and colours f32 [N, 3] in [0, 1], of raw parameters.
 
     Choices: the normal is the shortest axis, the first of equal ones; the colour that of SH degree
       0.
@@ -109,9 +105,7 @@ def surface_of(parameters: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.nda
 
 
 class _Take(torch.autograd.Function):
-    """Rows by an index without repeats: the gradient is one scatter, where plain indexing has to
-    accumulate.
-    """
+    """Rows by an index without repeats: the gradient is one scatter, and accumulates nothing."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, index: Tensor) -> Tensor:

@@ -1,6 +1,4 @@
-"""What hangs together: Gaussians that touch, and those that touch them, are one part; points by
-the cubes of a grid that hold them.
-"""
+"""Parts of scenes: Gaussians joined through those that touch, points by the cubes of a grid."""
 
 from __future__ import annotations
 
@@ -11,26 +9,26 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-NEIGHBORS = 16  # nearest of the chosen that a Gaussian is held against
+NEIGHBORS = 16  # nearest selected ones that a Gaussian is compared with
 REACH = 2.0  # standard deviations along the longest axis
 Corner = np.ndarray | Sequence[float] | None
 FARTHEST = 2.0**40  # cubes from the origin along an axis; what lies beyond counts as there
 
 
-def parts(means: np.ndarray, scales: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Number of the part of each chosen Gaussian, i64 [N], the largest part 0; -1 for all others.
+def parts(means: np.ndarray, scales: np.ndarray, selected: np.ndarray) -> np.ndarray:
+    """Number of the part of each selected Gaussian, i64 [N], the largest part 0; -1 for all others.
 
-    Args: means [N, 3]; scales [N, 3] standard deviations, activated; both scene units; chosen: bool
-      [N].
+    Args: means [N, 3]; scales [N, 3] standard deviations, activated; both scene units; selected:
+      bool [N].
     Choices: two touch if the spheres of two standard deviations along their longest axes do; each
-      is held against its 16 nearest, which is symmetrised by union. Parts of one size are in order
+      is compared with its 16 nearest, which is symmetrised by union. Parts of one size are in order
       of their first Gaussians.
     """
-    found, rows = np.full(len(chosen), -1, np.int64), np.flatnonzero(chosen)
+    part_of, rows = np.full(len(selected), -1, np.int64), np.flatnonzero(selected)
     n = len(rows)
     if n < 2:
-        found[rows] = 0
-        return found
+        part_of[rows] = 0
+        return part_of
     reach = REACH * scales[rows].max(1)
     distances, near = cKDTree(means[rows]).query(means[rows], k=min(NEIGHBORS + 1, n))
     touching = distances <= reach[:, None] + reach[near]
@@ -38,22 +36,20 @@ def parts(means: np.ndarray, scales: np.ndarray, chosen: np.ndarray) -> np.ndarr
     edges = coo_array((np.ones(len(starts), bool), (starts, near[touching])), shape=(n, n))
     _, numbers = connected_components(edges, directed=False)
     order = np.argsort(-np.bincount(numbers), kind="stable")
-    found[rows] = np.argsort(order)[numbers]
-    return found
+    part_of[rows] = np.argsort(order)[numbers]
+    return part_of
 
 
 def substantial(
-    means: np.ndarray, scales: np.ndarray, chosen: np.ndarray, least: float = 0.1
+    means: np.ndarray, scales: np.ndarray, selected: np.ndarray, least: float = 0.1
 ) -> np.ndarray:
-    """The chosen without their crumbs: bool [N], those of parts of at least a share `least` of the
-    largest part.
-    """
-    numbers = parts(means, scales, chosen)
-    sizes = np.bincount(numbers[chosen])
-    kept: np.ndarray = chosen.copy()
+    """The selected, bool [N], in parts of at least a share `least` of the largest: no crumbs."""
+    numbers = parts(means, scales, selected)
+    sizes = np.bincount(numbers[selected])
+    mask: np.ndarray = selected.copy()
     if len(sizes):
-        kept[chosen] = sizes[numbers[chosen]] >= least * sizes[0]
-    return kept
+        mask[selected] = sizes[numbers[selected]] >= least * sizes[0]
+    return mask
 
 
 def cubes_of(points: np.ndarray, edge: float, origin: Corner = None) -> np.ndarray:

@@ -26,9 +26,7 @@ def inverse_depths(means: Tensor, normals: Tensor, K: Tensor, nearest: float) ->
 
 
 def inverse_of(K: Tensor) -> Tensor:
-    """K⁻¹ [3, 3] of a camera's K, whose last row is (0, 0, 1), without `inv`'s check, for which a
-    GPU waits.
-    """
+    """K⁻¹ [3, 3] of K, whose last row is (0, 0, 1), without `inv`'s check: a GPU waits for that."""
     (fx, skew, cx), (_, fy, cy), (_, _, one) = K
     zero = torch.zeros_like(one)
     rows = [
@@ -46,16 +44,12 @@ def inverse_of(K: Tensor) -> Tensor:
 
 
 def _along(means: Tensor, normals: Tensor, nearest: float) -> tuple[Tensor, Tensor]:
-    """Distance [N] of each plane from the camera, of any sign, and the least [N] at which it is not
-    grazed.
-    """
+    """Distance [N] of each plane from the camera, signed, and the least [N] that is not grazing."""
     return (normals * means).sum(-1), GRAZING * means.norm(dim=-1).clamp_min(nearest)
 
 
 class _Planes(torch.autograd.Function):
-    """`planes_in_view`; its gradient by hand takes a fifth of the time of one through rotation
-    matrices.
-    """
+    """`planes_in_view` with a gradient by hand, for a fifth of the time of autograd's."""
 
     @staticmethod
     def forward(

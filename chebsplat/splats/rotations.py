@@ -1,6 +1,4 @@
-"""Rotations of Gaussians: quaternions wxyz, of any length. Once for torch, once for kernels, which
-do without.
-"""
+"""Rotations of Gaussians, quaternions wxyz of any length: in torch, and in numpy for kernels."""
 
 from __future__ import annotations
 
@@ -30,9 +28,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
 
 
 def rotation_matrices_f64(quats: np.ndarray) -> np.ndarray:
-    """As `rotation_matrices` in numpy, [..., 3, 3] f64 of quaternions [..., 4]: what kernels are
-    fed with.
-    """
+    """`rotation_matrices` in numpy, for kernels: f64 [..., 3, 3] of quaternions [..., 4]."""
     q = np.asarray(quats, np.float64)
     q = q / np.abs(q).max(-1, keepdims=True).clip(1e-30)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True).clip(1e-12), -1, 0)

@@ -69,8 +69,8 @@ def light(coefficients: Tensor, directions: Tensor, degree: int, backend: str = 
       for.
     """
     if coefficients.device.type == "cuda" and backend != "reference":
-        seen: Tensor = gsplat().spherical_harmonics(degree, directions, coefficients)
-        return seen
+        colors: Tensor = gsplat().spherical_harmonics(degree, directions, coefficients)
+        return colors
     values = basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     return torch.einsum("nk,nkc->nc", values, coefficients[:, : n_coefficients(degree)])
 
@@ -141,8 +141,8 @@ def colors_in_view(
 
 def _coefficients(bands: Sequence[Tensor], masks: Tensor | None, index: Tensor | None) -> Tensor:
     """Masked coefficients [V, K, 3] of all bands. Choices: a band that only the first Gaussians
-    have is filled up with
-    zeros, rather than cut to those in view that have it: a cut has to wait for their number.
+    have is filled up with zeros, rather than cut to those in view that have it: a cut has to wait
+    for their number.
     """
     parts, n = [], len(bands[0])
     for at, band in enumerate(bands):

@@ -1,5 +1,4 @@
-"""Colour by spherical harmonics of the Gaussians in view, in numba: a Gaussian costs only the bands
-it keeps.
+"""Colour by spherical harmonics in numba: a Gaussian in view costs only the bands that it keeps.
 
 Reads and writes whole parameters, so that no copy of the coefficients in view is ever made. A band
 is a tensor [N_l, 2 l + 1, 3] that the first N_l Gaussians have. `sh` holds the plain twin, and
@@ -42,10 +41,8 @@ def _basis(means, eye, i, degree, out):
 
 
 @body
-def _kept(bands, n_held, i, v, degree):
-    """The highest band that counts for Gaussian i, row v of the masks: it has it, and so for all
-    bands below.
-    """
+def _top_band(bands, n_held, i, v, degree):
+    """Highest band that counts for Gaussian i, row v of the masks: it and all below are there."""
     top = 0
     while top < degree and i < n_held[top] and bands[v, top] != 0:
         top += 1
@@ -54,7 +51,7 @@ def _kept(bands, n_held, i, v, degree):
 
 @body
 def _band(values, first, band, i, c):
-    """What one band adds to channel c of Gaussian i."""
+    """Contribution of one band to channel c of Gaussian i."""
     total = 0.0
     for k in range(band.shape[1]):
         total += values[first + k] * band[i, k, c]
@@ -66,7 +63,7 @@ def _forward(sh0, sh1, sh2, sh3, bands, index, means, eye, degree):
     out, n_held = np.empty((len(index), 3), np.float32), (len(sh1), len(sh2), len(sh3))
     for v in prange(len(index)):
         i, values = index[v], np.empty(16)
-        top = _kept(bands, n_held, i, v, degree)
+        top = _top_band(bands, n_held, i, v, degree)
         _basis(means, eye, i, top, values)
         for c in range(3):
             total = 0.5 + values[0] * sh0[i, 0, c]
@@ -95,9 +92,7 @@ def _clear(out, i):
 
 @kernel
 def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_bands):
-    """Gradients to sh0, to each band and, if asked for, to the masks [V, 3] (straight through
-    closed ones too).
-    """
+    """Gradients to sh0, each band and, if asked for, the masks [V, 3], closed ones included."""
     n, n_held = len(means), (len(sh1), len(sh2), len(sh3))
     to_sh0, to_sh1 = np.empty((n, 1, 3), np.float32), np.empty(sh1.shape, np.float32)
     to_sh2, to_sh3 = np.empty(sh2.shape, np.float32), np.empty(sh3.shape, np.float32)
@@ -112,7 +107,7 @@ def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_ba
             _clear(to_sh3, i)
     for v in prange(len(index)):
         i, values = index[v], np.empty(16)
-        top = _kept(bands, n_held, i, v, degree)
+        top = _top_band(bands, n_held, i, v, degree)
         _basis(means, eye, i, degree if for_bands else top, values)
         for c in range(3):
             g = grad[v, c] if out[v, c] > 0 or grad[v, c] < 0 else np.float32(0)
@@ -160,9 +155,7 @@ def colors_in_view(
     eye: Tensor,
     degree: int,
 ) -> Tensor:
-    """As `sh.colors_in_view`, of float32 on the CPU; a closed band costs nothing, unless its mask
-    learns.
-    """
+    """`sh.colors_in_view` of float32 on the CPU; a closed band is free unless its mask learns."""
     used = [band if at <= degree else band[:0].detach() for at, band in enumerate(bands)]
     used += [bands[0].new_zeros(0, 2 * at + 1, 3) for at in range(len(used), 4)]
     if masks is None:

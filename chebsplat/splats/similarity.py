@@ -1,6 +1,4 @@
-"""Similarities: a frame of points, cameras and Gaussians turned, scaled and shifted into
-another.
-"""
+"""Similarities: points, cameras and Gaussians turned, scaled and shifted into another frame."""
 
 from __future__ import annotations
 
@@ -25,18 +23,14 @@ class Similarity(NamedTuple):
         return np.asarray(self.scale * points @ self.rotation.T + self.shift)
 
     def of_cameras(self, cam_from_world: np.ndarray) -> np.ndarray:
-        """Poses [V, 4, 4] of cameras that see the same in the other frame; their own unit becomes
-        its unit.
-        """
+        """Poses [V, 4, 4] of cameras that see the same in the other frame, in its unit."""
         poses = cam_from_world.astype(np.float64)
         poses[:, :3, :3] = poses[:, :3, :3] @ self.rotation.T
         poses[:, :3, 3] = self.scale * poses[:, :3, 3] - poses[:, :3, :3] @ self.shift
         return poses
 
     def of_gaussians(self, parameters: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Raw parameters of Gaussians that look the same in the other frame, their light turned
-        with them.
-        """
+        """Raw parameters of Gaussians that look the same in the other frame, light turned too."""
         w, x, y, z = parameters["quats"].astype(np.float64).T
         a, b, c, d = Rotation.from_matrix(self.rotation).as_quat(scalar_first=True)
         product = [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y]
@@ -65,9 +59,7 @@ class Similarity(NamedTuple):
 
 
 def fitted(points: np.ndarray, others: np.ndarray) -> Similarity:
-    """The similarity that brings points [N, 3] nearest to their others [N, 3], by least squares
-    (Umeyama's).
-    """
+    """The similarity that brings points [N, 3] nearest to others [N, 3], by Umeyama's method."""
     middle, other = points.mean(0), others.mean(0)
     left, lengths, right = np.linalg.svd((others - other).T @ (points - middle))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
@@ -77,8 +69,8 @@ def fitted(points: np.ndarray, others: np.ndarray) -> Similarity:
 
 
 def turned_light(rotation: np.ndarray) -> np.ndarray:
-    """The matrix [15, 15] that turns coefficients of bands 1 to 3: seen along R d, the light is
-    what it was along d.
+    """The matrix [15, 15] by which coefficients of bands 1 to 3 show along R d what they did along
+    d.
 
     Choices: by the light along more directions than there are coefficients, which determine these
       exactly.

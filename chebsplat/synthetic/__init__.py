@@ -5,6 +5,7 @@ Metres, z up, the floor at z = 0; colours are linear, in [0, 1]; triangles are [
 """
 
 CLASS_NAMES = (
-    "wall", "floor", "ceiling", "door", "window", "blinds", "desk", "table", "chair", "sofa", "cabinet", "shelf",
-    "monitor", "keyboard", "lamp", "bin", "rug", "plant", "clock", "picture", "book", "cushion",
+    "wall", "floor", "ceiling", "door", "window", "blinds", "desk", "table", "chair", "sofa",
+    "cabinet", "shelf", "monitor", "keyboard", "lamp", "bin", "rug", "plant", "clock", "picture",
+    "book", "cushion",
 )  # fmt: skip

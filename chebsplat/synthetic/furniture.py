@@ -1,6 +1,4 @@
-"""Furniture from parametric solids. Every piece stands at its frame's origin, its back at local y =
-0, facing +y.
-"""
+"""Furniture from parametric solids, each at its frame's origin: back at local y = 0, facing +y."""
 
 from __future__ import annotations
 
@@ -77,9 +75,7 @@ def table(b: Builder, f: Frame, wood: int, width: float, depth: float, height: f
 
 
 def chair(b: Builder, f: Frame, wood: int, fabric: int) -> None:
-    """A chair with the legs of the table's wood: same texture, another shape. It faces +y; its back
-    is at y = 0.
-    """
+    """A chair with the legs of the table's wood: same texture, another shape."""
     b.box("chair", fabric, f, (-0.21, 0, 0.43), (0.21, 0.42, 0.48))
     legs(b, "chair", wood, f, 0.42, 0.42, 0.43, 0.04)
     for x in (-0.21, 0.17):
@@ -199,9 +195,7 @@ def plant(
     height: float = 0.9,
     behind: float = 0.19,
 ) -> None:
-    """Leaves spread to all sides, but grow steeply where only `behind` metres are left to the
-    wall.
-    """
+    """Leaves to all sides, but growing steeply where the wall is only `behind` metres away."""
     middle = f.moved(0, 0.22, 0)
     b.revolved("plant", pot, middle, [(0.11, 0), (0.16, 0.3), (0.14, 0.3), (0.13, 0.26)])
     for k in range(16):
@@ -239,7 +233,8 @@ def picture(b: Builder, f: Frame, frame: int, canvas: int, width: float, height:
     """On a wall at its frame's height; the wall is at y = 0."""
     b.box("picture", frame, f, (-width / 2, 0, -height / 2), (width / 2, 0.025, height / 2))
     inset = 0.04
-    b.box("picture", canvas, f, (-width / 2 + inset, 0.025, -height / 2 + inset), (width / 2 - inset, 0.03, height / 2 - inset))  # fmt: skip  # noqa: E501
+    x, z = width / 2 - inset, height / 2 - inset
+    b.box("picture", canvas, f, (-x, 0.025, -z), (x, 0.03, z))
 
 
 def door(b: Builder, f: Frame, wood: int, metal: int) -> None:

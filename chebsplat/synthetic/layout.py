@@ -1,6 +1,4 @@
-"""Whole rooms: what stands where, in which material, under which light; and which seeds are for
-what.
-"""
+"""Whole rooms: their furniture, materials and light; and the seeds reserved for each use."""
 
 from __future__ import annotations
 
@@ -25,9 +23,7 @@ KNOWLEDGE = range(20_000, 21_000)  # knowledge is taught on these
 
 @dataclass
 class Room:
-    """A scene to render: geometry, materials, and lights [L, 2, 3] (centre, half extent) in
-    metres.
-    """
+    """A scene to render: geometry, materials, lights [L, 2, 3] (centre, half extent) in metres."""
 
     soup: Soup
     materials: list[Material]

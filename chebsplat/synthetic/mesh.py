@@ -1,6 +1,4 @@
-"""A triangle soup with a label, a material and a texture frame for every triangle, built from
-simple solids.
-"""
+"""A triangle soup of simple solids: every triangle has a label, a material, a texture frame."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from chebsplat.synthetic import CLASS_NAMES
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a piece of furniture stands: origin [3] m, turned by yaw (rad) about the vertical."""
+    """Place of a piece of furniture: origin [3] m, turned by yaw (rad) about the vertical."""
 
     origin: tuple[float, float, float]
     yaw: float = 0.0
@@ -31,8 +29,7 @@ class Frame:
 
 @dataclass
 class Soup:
-    """vertices f32 [N, 3] m, triangles u32 [T, 3]; by triangle: labels i16, materials i16, parts
-    i32.
+    """vertices f32 [N, 3] m, triangles u32 [T, 3]; of each, labels and materials i16, parts i32.
 
     A part's texture coordinates are `rotations[part] @ (p − origins[part])`, with its longest side
     along x.
@@ -95,9 +92,7 @@ class Builder:
         profile: list[tuple[float, float]],
         n: int = 20,
     ) -> None:
-        """A surface of revolution about the local z axis through (radius, height) points, closed at
-        the ends.
-        """
+        """A surface of revolution about local z through (radius, height) points, ends closed."""
         angles = np.arange(n) * (2 * np.pi / n)
         rings = [
             np.stack([r * np.cos(angles), r * np.sin(angles), np.full(n, z)], 1) for r, z in profile

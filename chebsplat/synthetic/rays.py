@@ -14,7 +14,7 @@ TWO_ROUNDS = 40  # views from which on the path goes round twice
 
 
 def open3d() -> Any:
-    """The module, loaded when it is first asked for.
+    """The module, imported on first use.
 
     Raises: ConfigError, with the remedy, where it or a library that it is linked to is missing.
     Choices: libusb, which few machines have, is loaded first, from libusb-package: open3d's loader
@@ -36,9 +36,7 @@ def open3d() -> Any:
 
 
 class Hits(NamedTuple):
-    """distance f32 [N] along the ray (inf: none), triangle i64 [N] (-1: none), normals f32 [N, 3]
-    of unit length.
-    """
+    """Of rays: distance f32 [N], inf: none; triangle i64 [N], -1: none; unit normals f32 [N, 3]."""
 
     distance: np.ndarray
     triangle: np.ndarray
@@ -82,9 +80,7 @@ class RayCaster:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """cam_from_world [4, 4] of a camera at `eye` that looks at `target`, OpenCV axes, world z
-    up.
-    """
+    """cam_from_world [4, 4] of a camera at `eye` looking at `target`, OpenCV axes, world z up."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
@@ -99,11 +95,10 @@ def walk(size: tuple[float, float, float], n_views: int, seed: int) -> np.ndarra
 
     Choices: two rounds, the second lower, closer and turned the other way; the gaze crosses the
       room, swings by ±49° and nods twice a round between 26° down and 4° up, so every surface is
-      met from several sides. Few views make
-      one round with half the swing and one nod: neighbours would share too little otherwise. No eye
-        is below 1.47 m,
-      which clears the chairs (1.05 m at most) by 0.4 m; what is taller stands at a wall. In 200
-      shuffled rooms nothing comes nearer than 0.38 m.
+      seen from several sides. Few views make one round with half the swing and one nod: neighbours
+      would share too little otherwise. No eye is below 1.47 m, which clears the chairs (1.05 m at
+      most) by 0.4 m; what is taller stands at a wall. In 200 shuffled rooms nothing comes nearer
+      than 0.38 m.
     """
     rng = np.random.default_rng([seed, 1])
     phase = rng.uniform(0, 2 * np.pi)

@@ -19,9 +19,7 @@ Generator = np.random.Generator
 
 
 def jitter(room: layout.Room, rng: Generator) -> None:
-    """Give half of the room's materials other colours, some of them another pattern too, and move
-    its lights.
-    """
+    """Give half of the materials other colours, some another pattern too, and move the lights."""
     patterns = ["plain", *PATTERNS]
     for index, material in enumerate(room.materials):
         if rng.random() < 0.5:
@@ -89,7 +87,7 @@ def _above(b: Builder, p: layout.Palette, rng: Generator, f: Frame) -> None:
 
 
 def _upon(b: Builder, p: layout.Palette, rng: Generator, f: Frame, width: float) -> None:
-    """What lies on a top."""
+    """Things on a top."""
     for x in np.arange(-width / 2 + 0.25, width / 2 - 0.2, 0.5):
         spot = f.moved(x + rng.uniform(-0.05, 0.05), 0.05, 0)
         match int(rng.integers(7)):
@@ -177,13 +175,12 @@ def _small(b: Builder, p: layout.Palette, rng: Generator, f: Frame, width: float
 
 
 PIECES = (
-    (_cabinet, 1.2), (_tall_cabinet, 0.9), (_desk, 1.4), (_table, 1.0), (_sofa, 1.9), (_shelf, 0.95), (_window, 1.3),
-    (_window, 1.7), (_door, 1.1), (_small, 0.5), (_small, 0.5), (_small, 0.5),
+    (_cabinet, 1.2), (_tall_cabinet, 0.9), (_desk, 1.4), (_table, 1.0), (_sofa, 1.9),
+    (_shelf, 0.95), (_window, 1.3), (_window, 1.7), (_door, 1.1),
+    (_small, 0.5), (_small, 0.5), (_small, 0.5),
 )  # fmt: skip
 
 
 def build(preset: str, seed: int) -> layout.Room:
-    """The room of a preset (`office`, `room`, `toy`, `shuffled`) and a seed. Raises KeyError on
-    another preset.
-    """
+    """The room of a preset (`office`, `room`, `toy`, `shuffled`) and seed; else a KeyError."""
     return shuffled(seed) if preset == "shuffled" else layout.build(preset, seed)

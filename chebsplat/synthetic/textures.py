@@ -1,7 +1,6 @@
 """Solid textures: colour of a point from its texture coordinates, smooth at the scale of a pixel.
 
-Its shade: ambient light, two ceiling panels with soft shadows, and a highlight that moves with the
-  eye.
+Its shade: ambient light, two panels with soft shadows, and a highlight that moves with the eye.
 """
 
 from __future__ import annotations
@@ -118,8 +117,8 @@ def _painting(p: np.ndarray, m: Material) -> np.ndarray:
 
 
 PATTERNS = {
-    "wood": _wood, "planks": _planks, "tiles": _tiles, "cloud": _cloud, "stripes": _stripes, "check": _check,
-    "rings": _rings, "dots": _dots, "painting": _painting,
+    "wood": _wood, "planks": _planks, "tiles": _tiles, "cloud": _cloud,
+    "stripes": _stripes, "check": _check, "rings": _rings, "dots": _dots, "painting": _painting,
 }  # fmt: skip
 
 
@@ -127,23 +126,21 @@ def colors(points: np.ndarray, materials: np.ndarray, table: list[Material]) -> 
     """Linear colour [N, 3] of texture coordinates [N, 3] (metres) under material indices [N]."""
     out = np.zeros((len(points), 3), np.float32)
     for index in np.unique(materials):
-        chosen, material = materials == index, table[index]
+        mask, material = materials == index, table[index]
         if material.pattern == "plain":
-            out[chosen] = material.first
+            out[mask] = material.first
             continue
-        mix = PATTERNS[material.pattern](points[chosen], material).astype(np.float32)[:, None]
+        mix = PATTERNS[material.pattern](points[mask], material).astype(np.float32)[:, None]
         value = mix * np.float32(material.first) + (1 - mix) * np.float32(material.second)
         if material.pattern == "painting":
-            hue = noise(points[chosen] / (0.7 * material.scale), material.seed + 3)[:, None]
+            hue = noise(points[mask] / (0.7 * material.scale), material.seed + 3)[:, None]
             value = 0.6 * value + 0.4 * hue * np.float32(material.first[::-1])
-        out[chosen] = value
+        out[mask] = value
     return out
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Row by row a · b, [N, 1]; several times faster on rows of three than a sum over the last
-    axis.
-    """
+    """Row by row a · b, [N, 1]; several times faster on rows of three than a sum over the axis."""
     products: np.ndarray = np.einsum("ni,ni->n", a, b)[:, None]
     return products
 

@@ -1,6 +1,4 @@
-"""Densification: new Gaussians in regions of steep gradient (Eqs 11-12), and 3DGS's own rule as the
-baseline.
-"""
+"""Densification: new Gaussians in regions of steep gradient (Eqs 11-12), and 3DGS's own rule."""
 
 from __future__ import annotations
 
@@ -19,9 +17,8 @@ SHRINK = 1.6  # 3DGS's divisor of the scales of two Gaussians that replace one
 
 class Additions(NamedTuple):
     """parents i64 [A]: whom each new Gaussian comes from. rows: raw parameters [A, ...] of the new
-    ones.
-    changed: raw parameters [A, ...] that the parents take on, by name (a parent occurs once at
-      most).
+    ones. changed: raw parameters [A, ...] that the parents take on, by name (a parent occurs once
+    at most).
     """
 
     parents: Tensor
@@ -30,9 +27,7 @@ class Additions(NamedTuple):
 
 
 def region_gradients(gradients: Tensor, members: Tensor) -> Tensor:
-    """Mean gradient [M] of each region's members (Eq 11); gradients [N], members i64 [M, n], -1
-    where padded.
-    """
+    """Mean gradient [M] of regions' members i64 [M, n], -1: padding (Eq 11); gradients [N]."""
     present = members >= 0
     if not present.any():
         return gradients.new_zeros(len(members))
@@ -124,8 +119,8 @@ def _places(
     candidates: Candidates,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Places [A, 3] of new Gaussians in regions of members [R, n] (-1 where padded), steepest
-    first, and the Gaussians
-    [A] that they come from. Args: excess [R]: of the gradient over the threshold.
+    first, and the Gaussians [A] that they come from. Args: excess [R]: of the gradient over the
+    threshold.
     """
     tree = cKDTree(means)
     centers, radii, spacings = _balls(tree, means, inside)
@@ -139,20 +134,18 @@ def _places(
     positions = centers[region] + radii[region, None] * _in_unit_ball(rng, len(region))
     distance, parents = tree.query(positions)
     spacing = spacings[region]
-    kept = np.flatnonzero(
+    rows = np.flatnonzero(
         (distance >= candidates.nearest * spacing) & (distance <= candidates.farthest * spacing)
     )
-    kept = kept[np.sort(np.unique(parents[kept], return_index=True)[1])]
-    kept = kept[_apart(positions[kept], candidates.nearest * spacing[kept])][:budget]
-    return positions[kept], parents[kept]
+    rows = rows[np.sort(np.unique(parents[rows], return_index=True)[1])]
+    rows = rows[_apart(positions[rows], candidates.nearest * spacing[rows])][:budget]
+    return positions[rows], parents[rows]
 
 
 def _balls(
     tree: cKDTree, means: np.ndarray, inside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Centres [R, 3], radii [R] and local spacings [R] of regions of members [R, n], -1 where
-    padded.
-    """
+    """Centres [R, 3], radii [R], local spacings [R] of regions of members [R, n], -1: padding."""
     present = inside >= 0
     where = np.where(present[..., None], means[inside], np.nan)
     empty = ~present.any(1)
@@ -176,7 +169,7 @@ def _in_unit_ball(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def _apart(positions: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Which positions [A] to keep, bool: those with no earlier one nearer than `least` [A]."""
+    """Mask [A] of the positions [A] with no earlier one nearer than `least` [A]."""
     keep = np.ones(len(positions), bool)
     if len(positions) > 1:
         pairs = cKDTree(positions).query_pairs(least.max(), output_type="ndarray")
@@ -219,7 +212,7 @@ def shared_scales(log_scales: Tensor, quats: Tensor, offsets: Tensor) -> Tensor:
 def classic_candidates(
     raw: dict[str, Tensor], gradients: Tensor, threshold: float, scale_limit: float
 ) -> tuple[Tensor, Tensor]:
-    """3DGS's choice by a Gaussian's own gradient [N]: whom to clone and whom to split, i64, the
+    """3DGS's choice by a Gaussian's own gradient [N]: those to clone and those to split, i64, the
     steepest first.
 
     Args: scale_limit: scene units; a Gaussian with a larger scale is split, any other one cloned.

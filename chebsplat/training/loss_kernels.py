@@ -1,9 +1,8 @@
-"""Losses and their gradients in one sweep over the image, in numba, float32: L1 and SSIM; distance
-of features.
+"""Losses with their gradients in one sweep over an image, in numba: L1 and SSIM; feature distance.
 
 Images are [H, W, 3] seen as rows of W · 3 values, so a tap of the horizontal window is a shift by
 3. Rows are independent in each of four passes; no pass writes what another thread writes, so the
-  thread count changes no bit.
+thread count changes no bit.
 """
 
 from __future__ import annotations
@@ -54,9 +53,7 @@ def _sum(terms):
 
 @kernel
 def _compare(blurred, weight):
-    """SSIM summed under a weight [H, L], by row, and its derivatives: to mean, variance and
-    covariance, [H, 3, L].
-    """
+    """SSIM by row, under a weight [H, L]; derivatives [H, 3, L] to mean, variance, covariance."""
     height, _, length = blurred.shape
     values = np.zeros(height, np.float64)
     slopes = np.zeros((height, 3, length), np.float32)
@@ -147,9 +144,7 @@ def photometric(
 
 @inline
 def _span(i, n, size):
-    """Pixels [start, stop) of cell i of n, as adaptive pooling cuts them: neighbours may share
-    one.
-    """
+    """Pixels [start, stop) of cell i of n by adaptive pooling: neighbours may share one."""
     return i * size // n, ((i + 1) * size + n - 1) // n
 
 

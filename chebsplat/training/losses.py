@@ -103,9 +103,7 @@ def photometric(
 def photometric_reference(
     render: Tensor, target: Tensor, mask: Tensor | None, weight_ssim: float
 ) -> Tensor:
-    """As `photometric`, in plain torch, of any float type on any device: twin and oracle of the
-    fused loss.
-    """
+    """Twin and oracle of `photometric`, in plain torch, of any float type on any device."""
     counted = torch.ones_like(target[..., 0]) if mask is None else mask.to(target.dtype)
     render = torch.where(counted[..., None] > 0, render, target)
     weight = counted[..., None].expand_as(target) / (counted.sum() * target.shape[-1]).clamp_min(
@@ -120,20 +118,19 @@ def photometric_reference(
 def depth_distance(
     inverse_depth: Tensor, alpha: Tensor, truth: Tensor, mask: Tensor | None
 ) -> Tensor:
-    """How far rendered surfaces lie from measured ones, relative to their depth: mean |Σ wᵢ (d / zᵢ
-    − 1)|.
+    """Relative distance of rendered surfaces from measured ones: mean |Σ wᵢ (d / zᵢ − 1)|.
 
     Args: inverse_depth [H, W] Σ wᵢ / zᵢ, alpha [H, W, 1] Σ wᵢ; truth d [H, W], nan where unknown;
       mask [H, W] or None.
     Choices: no division by alpha, so that a pixel that little covers pulls little; 0 where nothing
       is known.
     """
-    known = torch.isfinite(truth) & (truth > 0)
+    has_depth = torch.isfinite(truth) & (truth > 0)
     if mask is not None:
-        known &= mask > 0
-    d = torch.where(known, truth, 1)
-    distance = torch.where(known, (inverse_depth * d - alpha[..., 0]).abs(), 0)
-    return distance.sum() / known.sum().clamp_min(1)
+        has_depth &= mask > 0
+    d = torch.where(has_depth, truth, 1)
+    distance = torch.where(has_depth, (inverse_depth * d - alpha[..., 0]).abs(), 0)
+    return distance.sum() / has_depth.sum().clamp_min(1)
 
 
 class _FeatureDistance(torch.autograd.Function):
@@ -159,8 +156,8 @@ class _FeatureDistance(torch.autograd.Function):
 def cell_shares(
     mask: Tensor | None, size: tuple[int, int], like: Tensor, counted: Tensor | None = None
 ) -> Tensor:
-    """What each cell of the target counts, [h, w], summing to 1 (or 0): the mean of its pixels'
-    mask [H, W], and nothing where `counted` [h, w] is false. Of the type and device of `like`.
+    """Weight of each cell of the target, [h, w], of sum 1 (or 0): the mean of its pixels' mask [H,
+    W], and 0 where `counted` [h, w] is false. Of the type and device of `like`.
     """
     if mask is None:
         share = like.new_full(size, 1 / (size[0] * size[1]))
@@ -182,10 +179,9 @@ def feature_distance(
     """Mean distance to the teacher's features at the teacher's resolution.
 
     Args: render [H, W, C]; target [h, w, C], h ≤ H; mask [H, W] bool, true where a pixel counts, or
-      float ≥ 0, how
-      much it does. kind: `length` of the difference over √C, or `l1`, its mean magnitude by
-        channel; counted [h, w]
-      bool: cells of the target that say something, None: all do; backend: of `rasterize`.
+      float ≥ 0, how much it does. kind: `length` of the difference over √C, or `l1`, its mean
+      magnitude by channel; counted [h, w] bool: cells of the target that count, None: all do;
+      backend: of `rasterize`.
     Choices: the render is averaged over each cell of the target; a cell counts by the mean of its
       pixels' mask. Where views disagree about a Gaussian the shortest total length is at their
       geometric median, which lies near the most common vector; the median channel by channel, where
@@ -205,9 +201,7 @@ def feature_distance_reference(
     kind: str = "length",
     counted: Tensor | None = None,
 ) -> Tensor:
-    """As `feature_distance`, in plain torch, of any float type on any device: twin and oracle of
-    the fused loss.
-    """
+    """Twin and oracle of `feature_distance`, in plain torch, of any float type on any device."""
     size = (target.shape[0], target.shape[1])
     pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)
     share = cell_shares(mask, size, render, counted)
@@ -229,12 +223,11 @@ def semantic_loss(
     settings: TrainSection,
     backend: str = "auto",
 ) -> Tensor:
-    """What a view's rendered features [H, W, C] cost, by `train.feature_loss`; cells without a
-    label cost nothing.
+    """Loss of a view's rendered features [H, W, C], by `train.feature_loss`; 0 for cells without a
+    label.
 
     Args: features [h, w, C] and labels of the teacher; mask [H, W], true where a pixel counts, or
-      None;
-      backend: of `rasterize`.
+      None; backend: of `rasterize`.
     Raises: ValueError where cross-entropy is asked for without labels.
     """
     if settings.feature_loss == "cross-entropy":
@@ -250,16 +243,14 @@ def semantic_loss(
 def label_entropy(
     render: Tensor, labels: TaughtLabels, mask: Tensor | None, temperature: float
 ) -> Tensor:
-    """Cross-entropy of labels on the logits render · class codes / temperature, weighted by
-    confidence.
+    """Cross-entropy of labels on logits render · class codes / temperature, by confidence.
 
     Args: render [H, W, C], as accumulated: a pixel that little covers has logits near 0; labels of
       h × w cells, h ≤ H; mask [H, W], as of `feature_distance`.
     Returns: the mean over cells that have a label, 0 where none has one.
     Choices: the render is averaged over each cell, as in `feature_distance`. The mean is over
-      cells, not over
-      confidences: a view of which the teacher is unsure teaches less than another, as in Panoptic
-        Lifting.
+      cells, not over confidences: a view of which the teacher is unsure teaches less than another,
+      as in Panoptic Lifting.
     """
     size = (labels.classes.shape[0], labels.classes.shape[1])
     pooled = torch.nn.functional.adaptive_avg_pool2d(render.permute(2, 0, 1), size).permute(1, 2, 0)

@@ -25,8 +25,8 @@ BANDS = ("sh0", "sh1", "sh2", "sh3")
 NEAREST = 0.01  # scene units, of a plane's depth: the rasterizer's near plane
 
 
-class Wanted(NamedTuple):
-    """The contents of a picture, as `SceneModel.render` is asked for it; size: (width, height)."""
+class RenderOptions(NamedTuple):
+    """Options of a call of `SceneModel.render`; size: (width, height)."""
 
     degree: int
     masked: bool
@@ -37,12 +37,11 @@ class Wanted(NamedTuple):
 
 @dataclass
 class Auxiliary:
-    """What losses need beside the picture; None where it was not wanted or does not exist.
+    """Values that losses need beside the picture; None where not asked for, or not there.
 
     soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]; in_view bool [V], None: all are. Of
-      the printed method:
-    soft_mask [N] and delta [N, 4] of all Gaussians, fused features [V, C], and L_reg []
-    (`knowledge`).
+      the printed method: soft_mask [N] and delta [N, 4] of all Gaussians, fused features [V, C],
+      and L_reg [] (`knowledge`).
     """
 
     soft_mask: Tensor | None = None
@@ -56,10 +55,8 @@ class Auxiliary:
 @dataclass
 class Rendered:
     """rgb [H, W, 3], alpha [H, W, 1], features [H, W, C], [h, w, C] by cell of the rasterizer, or
-    None; `index` [V]
-    the Gaussians in the frustum, None: all, with `means2d` [1, V, 2] and `radii` [1, V] in `meta`;
-      planes [H, W, 3],
-    Σ w_i q_i of `planes_in_view`, 1 / scene unit, or None.
+    None; `index` [V] the Gaussians in the frustum, None: all, with `means2d` [1, V, 2] and `radii`
+    [1, V] in `meta`; planes [H, W, 3], Σ w_i q_i of `planes_in_view`, 1 / scene unit, or None.
     """
 
     rgb: Tensor
@@ -79,10 +76,8 @@ class SceneModel:
     trainer freezes them.
 
     Args: raw: of `splats.gaussians.initial_gaussians`, with SH bands or without, on the device that
-      is to compute;
-      n_channels: of the features, None without semantics; backend: of `rasterize`, and of all else
-        in a step that has
-      a compiled kernel.
+      is to compute; n_channels: of the features, None without semantics; backend: of `rasterize`,
+      and of all else in a step that has a compiled kernel.
     """
 
     def __init__(
@@ -117,7 +112,7 @@ class SceneModel:
 
     @property
     def device(self) -> torch.device:
-        """Where the Gaussians are."""
+        """Device of the Gaussians."""
         return self.raw["means"].device
 
     @property
@@ -127,26 +122,20 @@ class SceneModel:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """What is learned beside the raw parameters, by name: the semantic gate, where there is
-        one.
-        """
+        """Modules that learn beside raw parameters, by name: the semantic gate, if any."""
         return {} if self.semantic_gate is None else {"semantic_gate": self.semantic_gate}
 
     def bands(self) -> list[Tensor]:
-        """Coefficients [N_l, 2 l + 1, 3] of the SH bands, from 0 to the highest that any Gaussian
-        has.
-        """
+        """Coefficients [N_l, 2 l + 1, 3] of SH bands 0 to the highest of any Gaussian."""
         return [self.raw[name] for name in BANDS if name in self.raw]
 
     def sh_kept(self) -> float:
-        """Part of all SH coefficients up to degree 3 that the Gaussians keep; until the freeze,
-        would keep.
-        """
+        """Share of SH coefficients up to degree 3 that Gaussians keep, or will at the freeze."""
         counts = [len(band) for band in self.bands()[1:]]
         if "sh_logits" in self.raw:
             counts = (self.open_bands() > 0.5).sum(0).tolist()[: len(counts)]
-        kept = sum(count * (2 * band + 3) for band, count in enumerate(counts))
-        return float((len(self) + kept) / (16 * max(len(self), 1)))
+        n_kept = sum(count * (2 * band + 3) for band, count in enumerate(counts))
+        return float((len(self) + n_kept) / (16 * max(len(self), 1)))
 
     @torch.no_grad()
     def open_bands(self) -> Tensor:
@@ -199,8 +188,8 @@ class SceneModel:
         """Colour and features in one pass.
 
         degree: SH bands in use; masked: apply the pruning masks; semantic: render features too;
-          grid: features are
-        only wanted as means over h × w cells, and rendered so where these are the rasterizer's;
+          grid: features are needed only as means over h × w cells, and rendered so where these are
+          the rasterizer's;
         depth: render it too, three channels beside the colours.
         Choices: on a GPU all Gaussians are rendered, since to choose those in view is to wait for
           their number.
@@ -209,13 +198,13 @@ class SceneModel:
         if not self.renders_all:
             with torch.no_grad():
                 index = in_frustum(self.raw["means"], view, _reach(self.raw))
-        wanted, learned = (
-            Wanted(degree, masked, semantic, depth, (view.width, view.height)),
+        options, learned = (
+            RenderOptions(degree, masked, semantic, depth, (view.width, view.height)),
             self.learned,
         )
         activated = self.replay(
-            wanted,
-            partial(self._activate, wanted, tuple(learned), index),
+            options,
+            partial(self._activate, options, tuple(learned), index),
             list(learned.values()),
             [view.viewmat, view.K],
         )
@@ -232,7 +221,7 @@ class SceneModel:
         if index is None:
             render, alpha, meta = rasterize(*gaussians, *camera, backend="cuda", harmless=True)
         elif features is None or (
-            grid is not None and wanted.size == (CELL * grid[1], CELL * grid[0])
+            grid is not None and options.size == (CELL * grid[1], CELL * grid[0])
         ):
             render, alpha, meta = rasterize(
                 *gaussians, *camera, cell_colors=features, backend=self.backend
@@ -244,11 +233,11 @@ class SceneModel:
         sizes = [3, 3 * depth, render.shape[-1] - 3 - 3 * depth]
         # one gradient, where slices would make one each
         rgb, planes, rest = render.squeeze(0).split(sizes, -1)
-        shown = rest if rest.shape[-1] else None
+        by_pixel = rest if rest.shape[-1] else None
         return Rendered(
             rgb,
             alpha.squeeze(0),
-            shown if cells is None else cells,
+            by_pixel if cells is None else cells,
             meta,
             index,
             auxiliary,
@@ -256,7 +245,7 @@ class SceneModel:
         )
 
     def _activate(
-        self, wanted: Wanted, names: tuple[str, ...], index: Tensor | None, *tensors: Tensor
+        self, options: RenderOptions, names: tuple[str, ...], index: Tensor | None, *tensors: Tensor
     ) -> dict[str, Tensor]:
         """Values of the Gaussians `index` as the rasterizer takes them, and their masks, by name.
 
@@ -270,20 +259,20 @@ class SceneModel:
         )
         features = take(raw["features"], index) if "features" in raw else None
         activated: dict[str, Tensor] = {}
-        if wanted.masked and (soft := self._soft_mask(raw, index, features)) is not None:
+        if options.masked and (soft := self._soft_mask(raw, index, features)) is not None:
             activated["soft_mask"] = soft
             scales, opacities = prune.apply_mask(prune.hard_mask(soft), scales, opacities)
         masks = None
-        if wanted.masked and wanted.degree > 0 and "sh_logits" in raw:
+        if options.masked and options.degree > 0 and "sh_logits" in raw:
             masks = activated["band_masks"] = sh_prune.band_mask(take(raw["sh_logits"], index))
         eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
         bands = [raw[name] for name in BANDS if name in raw]
         channels = [
-            colors_in_view(bands, masks, index, raw["means"], eye, wanted.degree, self.backend)
+            colors_in_view(bands, masks, index, raw["means"], eye, options.degree, self.backend)
         ]
-        if wanted.depth:
+        if options.depth:
             channels.append(planes_in_view(means, quats, scales, viewmat, K, NEAREST))
-        if wanted.semantic and features is not None:  # the masks have seen them in any case
+        if options.semantic and features is not None:  # the masks have seen them in any case
             if index is None:
                 channels.append(features)
             else:
@@ -293,7 +282,7 @@ class SceneModel:
         if index is None:
             gaussians = made_harmless(*gaussians)
             activated["in_view"] = may_be_seen(
-                raw["means"].detach(), View(K, viewmat, *wanted.size), _reach(raw)
+                raw["means"].detach(), View(K, viewmat, *options.size), _reach(raw)
             )
         return activated | dict(
             zip(("means", "quats", "scales", "opacities", "colors"), gaussians, strict=True)

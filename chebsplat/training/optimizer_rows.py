@@ -1,6 +1,4 @@
-"""Rows of parameters, and of the optimizer's moments, when Gaussians come, go and are put into
-another order.
-"""
+"""Rows of parameters and of the optimizer's moments as Gaussians come, go and change order."""
 
 from __future__ import annotations
 
@@ -14,16 +12,12 @@ from chebsplat.training.densify import Additions
 
 
 def select(raw: dict[str, Tensor], keep: Tensor) -> dict[str, Tensor]:
-    """The rows `keep` [N] bool of every tensor [N, ...], or [N_l, ...] that only the first N_l
-    Gaussians have.
-    """
+    """Rows `keep` [N] bool of tensors [N, ...], or [N_l, ...] of the first N_l Gaussians alone."""
     return {name: value.detach()[keep[: len(value)]] for name, value in raw.items()}
 
 
 def append(raw: dict[str, Tensor], rows: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Every tensor [N, ...] followed by its new rows [A, ...]. Raises ValueError if names or
-    lengths disagree.
-    """
+    """Every tensor [N, ...] followed by its new rows [A, ...]; ValueError if they do not fit."""
     if raw.keys() != rows.keys() or len({len(value) for value in rows.values()}) > 1:
         shapes = {name: tuple(value.shape) for name, value in rows.items()}
         raise ValueError(f"rows {shapes} do not fit parameters {sorted(raw)}")
@@ -31,18 +25,14 @@ def append(raw: dict[str, Tensor], rows: dict[str, Tensor]) -> dict[str, Tensor]
 
 
 def prune_optimizer(optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], keep: Tensor) -> None:
-    """Keep the rows `keep` [N] bool of parameters and moments; `raw` and the groups get the new
-    leaves.
-    """
+    """Keep rows `keep` [N] of parameters and moments; `raw` and groups get the new leaves."""
     _replace(optimizer, raw, select(raw, keep), lambda moment: moment[keep[: len(moment)]])
 
 
 def reorder_optimizer(
     optimizer: torch.optim.Optimizer, raw: dict[str, Tensor], rows: dict[str, Tensor]
 ) -> None:
-    """Parameters and moments by name become their rows i64; those that have none left are gone,
-    groups and all.
-    """
+    """Put rows i64, by name, in place of parameters and moments; drop what has none left."""
     for name, order in rows.items():
         _replace(
             optimizer,
@@ -107,7 +97,7 @@ def forget(optimizer: torch.optim.Optimizer, parameter: Tensor) -> None:
 
 
 def _moments(optimizer: torch.optim.Optimizer, parameter: Tensor) -> dict[str, Tensor]:
-    """What the optimizer holds per entry of a parameter; the step count is not."""
+    """Moments that the optimizer has for each entry of a parameter; its step count is none."""
     state = optimizer.state.get(parameter, {})
     return {
         k: v

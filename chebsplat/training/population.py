@@ -1,6 +1,4 @@
-"""Which Gaussians there are: growth, removal, the freeze of SH bands. Parameters and moments keep
-together.
-"""
+"""Population of Gaussians: growth, removal and freeze of SH bands, with the optimizer's moments."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ class Population:
     places: of the training cameras, scene units [V, 3]; those that are not finite bound nothing.
     `n_grown` and `n_reset` count the times that some were added and that all were dimmed, the
     others Gaussians: `n_broken` those whose values a step made non-finite. The caller refreshes the
-      regions after any change.
+    regions after any change.
     """
 
     def __init__(
@@ -40,9 +38,7 @@ class Population:
         self.clear_gradients()
 
     def state_dict(self) -> dict[str, Any]:
-        """Counts, bounds, and the gradients gathered since growth: tensors, not copied, and plain
-        values.
-        """
+        """Counts, bounds, gradients since growth: tensors, not copied, and plain values."""
         return {
             "counts": [self.n_grown, self.n_reset, self.n_added, self.n_removed, self.n_broken],
             "tensors": [self.gradient_sum, self.gradient_count, self.log_bound],
@@ -59,9 +55,7 @@ class Population:
         self.gradient_sum, self.gradient_count = (means.new_zeros(len(means)) for _ in range(2))
 
     def note_gradients(self, rendered: Rendered) -> None:
-        """Length of the total loss' gradient to the 2D means, in half image widths as gsplat counts
-        it.
-        """
+        """Add the length of the loss' gradient to 2D means, in half image widths as in gsplat."""
         if self.settings.region_gradient == "features" and rendered.auxiliary.fused is not None:
             gradient = rendered.auxiliary.fused.grad
             if gradient is not None:
@@ -83,7 +77,7 @@ class Population:
             self.gradient_count.index_add_(0, rendered.index, visible.to(length))
 
     def note_distances(self) -> None:
-        """How large each Gaussian may be where it is now: see `bound_scales`."""
+        """Bound each Gaussian's size where it is now: see `bound_scales`."""
         means = self.model.raw["means"].detach()
         distance = self.cameras.query(means.nan_to_num().cpu().numpy())[0]
         bound = torch.from_numpy(distance * self.settings.scale_limit).clamp_min(TINY)
@@ -91,8 +85,7 @@ class Population:
 
     @torch.no_grad()
     def bound_scales(self) -> None:
-        """Keep scales below `scale_limit` times the distance to the nearest camera, as
-        `note_distances` saw it last.
+        """Keep scales below `scale_limit` times the distance to the nearest camera, as last noted.
 
         Choices: EWA takes perspective for linear across a Gaussian, which holds for small ones. A
           needle that reaches past cameras is another haze before each of them, and training fits it
@@ -140,7 +133,7 @@ class Population:
 
     @torch.no_grad()
     def remove(self, optimizer: torch.optim.Optimizer, mask: Tensor | None) -> None:
-        """Hard-prune what is faint or, of the first Gaussians, closed by their soft mask;
+        """Hard-prune faint Gaussians and those that `mask`, which is of the first ones, closes;
         `min_gaussians` stay.
         """
         strength = self.model.raw["logit_opacities"].sigmoid()
@@ -154,9 +147,7 @@ class Population:
 
     @torch.no_grad()
     def dim(self, optimizer: torch.optim.Optimizer) -> None:
-        """3DGS's reset: no opacity above DIMMED. What the photos need comes back, what floats does
-        not.
-        """
+        """3DGS's reset: no opacity above DIMMED. Those that photos need rise again."""
         opacities = self.model.raw["logit_opacities"]
         opacities.clamp_(max=math.log(DIMMED / (1 - DIMMED)))
         optimizer_rows.forget(optimizer, opacities)
@@ -164,8 +155,8 @@ class Population:
 
     @torch.no_grad()
     def drop_broken(self, optimizer: torch.optim.Optimizer) -> bool:
-        """Remove Gaussians with a value that is not finite; were there any? Leaves fewer than
-        `min_gaussians` alone.
+        """Remove Gaussians with a non-finite value; True if any were removed. Where fewer than
+        `min_gaussians` would stay none is.
         """
         sound = torch.ones(len(self.model), dtype=torch.bool, device=self.model.device)
         for value in self.model.raw.values():
@@ -182,9 +173,7 @@ class Population:
 
     @torch.no_grad()
     def freeze_bands(self, optimizer: torch.optim.Optimizer) -> None:
-        """Fix every Gaussian's SH degree, once: what is closed leaves parameters, moments and
-        memory.
-        """
+        """Fix every Gaussian's SH degree, once: closed bands leave parameters and moments."""
         raw = self.model.raw
         degrees = self.model.close_bands().clamp_max(self.settings.sh_degree)
         rows = sh_prune.ragged_rows(degrees)
@@ -202,7 +191,7 @@ def finite_rows(value: Tensor) -> Tensor:
 
 
 def broken(model: SceneModel) -> str:
-    """Which parameters and weights are not finite, for a message; empty if all are."""
+    """Names of parameters and weights that are not finite, for a message; empty if all are."""
     rows = [(name, (~finite_rows(value)).nonzero()[:, 0]) for name, value in model.raw.items()]
     parts = [f"{name} of {len(bad)} Gaussians, first {bad[0]}" for name, bad in rows if len(bad)]
     for name, module in model.modules.items():

@@ -1,6 +1,4 @@
-"""The paper's method in the trainer: a scene whose every step runs the modules of
-`chebsplat.printed`.
-"""
+"""The paper's method in the trainer: a scene whose steps run the modules of `chebsplat.printed`."""
 
 from __future__ import annotations
 
@@ -75,9 +73,8 @@ class PrintedScene(SceneModel):
     """A `SceneModel` by the print: `sh_logits` are [N, 4], and fused features go into everything.
 
     bases: B of each key projection matrix, by name, of the scenes before; empty: none. Regions,
-      descriptors and
-    weights of Eq 8 are those of the Gaussians as they are at a step, without gradient to means and
-    covariances.
+      descriptors and weights of Eq 8 are those of the Gaussians as they are at a step, without
+      gradient to means and covariances.
     """
 
     def __init__(
@@ -219,9 +216,7 @@ class PrintedScene(SceneModel):
         return Rendered(image, alpha[0], features if semantic else None, meta, index, auxiliary)
 
     def _pull(self, tokens: Tensor, regions: Regions) -> Tensor | None:
-        """L_reg (Eq 14): mean over key projection matrices, alpha the mean over regions; None
-        without a basis.
-        """
+        """L_reg (Eq 14): mean over projection matrices, alpha over regions; None without bases."""
         if not self.bases or not len(regions.centers):
             return None
         present = nn.functional.pad(regions.members >= 0, (1, 0), value=True)
@@ -257,12 +252,10 @@ class PrintedScene(SceneModel):
 
     @torch.no_grad()
     def close_bands(self) -> Tensor:
-        """Set closed bands, the lowest included, to zero; returns each Gaussian's highest open band
-        u8 [N].
-        """
+        """Zero closed bands, the lowest included; returns the highest open ones u8 [N]."""
         is_open = self._open()
-        for band, kept in zip(self.bands(), is_open.unbind(1), strict=False):
-            band.mul_(kept[:, None, None])
+        for band, mask in zip(self.bands(), is_open.unbind(1), strict=False):
+            band.mul_(mask[:, None, None])
         degrees = torch.arange(4, device=self.device) * is_open
         return degrees.amax(1).to(torch.uint8)
 
@@ -333,10 +326,10 @@ class PrintedScene(SceneModel):
         middle = means[regions.centers[order]].repeat_interleave(counts[order], 0)
         candidates = densification.in_ball(middle, regions.radius, generator)
         spacing = _median_spacing(means)
-        kept, parents = densification.accepted(
+        mask, parents = densification.accepted(
             candidates, means, NEAREST * spacing, FARTHEST * spacing
         )
-        candidates, parents = candidates[kept][:budget], parents[kept][:budget]
+        candidates, parents = candidates[mask][:budget], parents[mask][:budget]
         rows = {name: value.detach()[parents] for name, value in self.raw.items()}
         return Additions(parents, rows | {"means": candidates}, {})
 

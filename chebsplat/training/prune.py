@@ -12,9 +12,8 @@ class SemanticGate(nn.Module):
     """Pruning logit [N] from semantic features [N, C]; starts open, alike for all.
 
     Choices: starts at logit 1, m̂ = 0.73, with `prune_logits` at 1 too: from 3 a short training's λ
-      does not get any
-      mask below the threshold. The caller detaches the features: they are taught by the teacher,
-        not by pruning.
+      does not get any mask below the threshold. The caller detaches the features: they are taught
+      by the teacher, not by pruning.
     """
 
     def __init__(self, n_channels: int, initial: float = 1.0):
@@ -29,8 +28,7 @@ class SemanticGate(nn.Module):
 
 
 def soft_mask(render_logits: Tensor, semantic_logits: Tensor | None) -> Tensor:
-    """m̂ [N] in (0, 1) of the rendering gate's logits [N] and the semantic gate's, the first alone
-    without semantics.
+    """m̂ [N] in (0, 1) of the rendering gate's logits [N] and, if any, the semantic gate's.
 
     Choices: the product, so that either gate alone can remove and neither overrules the other's
       removal; logits are clamped to ±10.
@@ -49,7 +47,5 @@ def hard_mask(soft: Tensor) -> Tensor:
 
 
 def apply_mask(mask: Tensor, scales: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-    """Masked scales [N, 3] and opacities [N], at render time only: what is stored never becomes log
-    0.
-    """
+    """Masked scales [N, 3] and opacities [N], for rendering: no stored value becomes log 0."""
     return scales * mask[:, None], opacities * mask

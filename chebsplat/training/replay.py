@@ -16,9 +16,7 @@ Function = Callable[..., dict[str, Tensor]]
 
 @dataclass
 class Recording:
-    """The layout of what a call was given beside leaves, and its CUDA graph from the second call
-    on.
-    """
+    """Layout of a call's inputs beside leaves; its CUDA graph from the second call on."""
 
     layout: list[tuple[Any, ...]]
     graph: Function | None = None
@@ -29,11 +27,10 @@ class Replay:
 
     A small scene's step is hundreds of small operations, which take longer to launch than to
     compute. A recording holds for the same `key` and tensors of the same shapes, and all of them
-    for the same
-    leaves: after growth and pruning they are made again. A first call is not recorded, so that
-    libraries have prepared what they need, nor is one without gradients. Where torch or the driver
-    cannot record, a warning says so, and `records` becomes false: then nothing is.
-    Results of a recording are overwritten by its next replay.
+    for the same leaves: after growth and pruning they are made again. A first call is not recorded,
+    so that libraries have prepared what they need, nor is one without gradients. Where torch or the
+    driver cannot record, a warning says so, and `records` becomes false: then nothing is. Results
+    of a recording are overwritten by its next replay.
     """
 
     def __init__(self, records: bool):
@@ -42,30 +39,30 @@ class Replay:
         self.recordings: dict[Hashable, Recording] = {}
 
     def __call__(
-        self, key: Hashable, function: Function, leaves: Sequence[Tensor], given: Sequence[Tensor]
+        self, key: Hashable, function: Function, leaves: Sequence[Tensor], inputs: Sequence[Tensor]
     ) -> dict[str, Tensor]:
-        """`function(*leaves, *given)`, a dictionary of tensors.
+        """`function(*leaves, *inputs)`, a dictionary of tensors.
 
         Args: key: what the function depends on beside its tensors; leaves: read where they lie, so
-          that what an optimizer wrote there is seen, or none; given: copied into the recording at
+          that what an optimizer wrote there is seen, or none; inputs: copied into the recording at
           each call.
         """
         if not self.records or not torch.is_grad_enabled():
-            return function(*leaves, *given)
+            return function(*leaves, *inputs)
         if leaves and [id(leaf) for leaf in leaves] != [id(leaf) for leaf in self.leaves]:
             self.leaves = list(leaves)
             self.recordings.clear()  # of other Gaussians
-        layout = [(value.shape, value.dtype, value.requires_grad) for value in given]
+        layout = [(value.shape, value.dtype, value.requires_grad) for value in inputs]
         recording = self.recordings.get(key)
         if recording is None or recording.layout != layout:
             self.recordings[key] = Recording(layout)
-            return function(*leaves, *given)
+            return function(*leaves, *inputs)
         if recording.graph is None:  # of aliases, so that gradients of the leaves are no part of it
             samples = [
                 *(leaf.detach() for leaf in leaves),
-                *(value.detach().clone() for value in given),
+                *(value.detach().clone() for value in inputs),
             ]
-            for sample, value in zip(samples, (*leaves, *given), strict=True):
+            for sample, value in zip(samples, (*leaves, *inputs), strict=True):
                 sample.requires_grad_(value.requires_grad)
             try:
                 graph: Any = torch.cuda.make_graphed_callables(
@@ -78,6 +75,6 @@ class Replay:
                 )
                 self.records, self.leaves = False, []
                 self.recordings.clear()  # whose memory the step may need
-                return function(*leaves, *given)
+                return function(*leaves, *inputs)
             recording.graph = graph
-        return recording.graph(*leaves, *given)
+        return recording.graph(*leaves, *inputs)

@@ -1,6 +1,4 @@
-"""The optimizer's rates, and what is due when in a training, as a function of the share of its
-budget that is spent.
-"""
+"""The optimizer's rates and the events of a training, by the share of its budget that is spent."""
 
 from __future__ import annotations
 
@@ -20,19 +18,15 @@ FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}
 
 
 def require_resolved(settings: TrainSection) -> None:
-    """Raises ValueError naming a setting that is still open (`stages.training.defaults.resolved`
-    decides them).
-    """
+    """Raises ValueError on an open setting (`stages.training.defaults.resolved` decides them)."""
     left = [name for name, value in settings if value is None and name not in ("seconds", "start")]
     if left:
         raise ValueError(f"train.{left[0]} is open: pass a section that is resolved")
 
 
 def rates(settings: TrainSection) -> dict[str, float]:
-    """Learning rate of each raw parameter before any schedule; that of `means` is relative to the
-    scene's extent.
-    """
-    given = {
+    """Learning rate of each raw parameter before any schedule; of `means`: in scene extents."""
+    by_name = {
         "means": settings.lr_means,
         "log_scales": settings.lr_scales,
         "quats": settings.lr_quats,
@@ -45,7 +39,7 @@ def rates(settings: TrainSection) -> dict[str, float]:
         "prune_logits": settings.lr_masks,
         "sh_logits": settings.lr_sh_masks,
     }
-    return {name: rate for name, rate in given.items() if rate is not None}
+    return {name: rate for name, rate in by_name.items() if rate is not None}
 
 
 def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.optim.Adam:
@@ -72,8 +66,7 @@ class Schedule:
     """Of a resolved train section, and photos whose longer side has `side` pixels.
 
     A budget is a number of steps, or seconds of training: then the pace is the machine's, and no
-      two
-    runs are the same.
+    two runs are the same.
     """
 
     def __init__(self, settings: TrainSection, side: int = STEP_SIDE):
@@ -97,22 +90,19 @@ class Schedule:
         return min(seconds / self.seconds, 1.0)
 
     def last_step(self, step: int, seconds: float) -> int:
-        """How many steps there will be, after `step` of them in `seconds`."""
+        """Number of steps of the whole training, after `step` of them in `seconds`."""
         if self.seconds is None:
             return self.steps
         return max(step, round(step * self.seconds / seconds)) if seconds > 0 else step + 1
 
     def rate(self, name: str, share: float, steps: int) -> float:
-        """What a group's learning rate is multiplied by, in a training that will have about so many
-        steps.
+        """Factor of a group's learning rate, in a training of about so many steps.
 
         Choices: pruning masks go no farther in a long training than in one of MOST_STEPS. A penalty
-          that Adam turns
-          into steps of one size closes them for as long as it lasts: 8000 steps left a room 4,832
-            of 40,000 Gaussians.
-          While steps look at windows, all are slower by the photos' reduction: a Gaussian is in few
-          of them, and between them Adam's mean square of gradients falls, and each step would go
-          that much farther.
+          that Adam turns into steps of one size closes them for as long as it lasts: 8000 steps
+          left a room 4,832 of 40,000 Gaussians. While steps look at windows, all are slower by the
+          photos' reduction: a Gaussian is in few of them, and between them Adam's mean square of
+          gradients falls, and each step would go that much farther.
         """
         slower = min(MOST_STEPS / max(steps, 1), 1.0) if name == "prune_logits" else 1.0
         slower /= self.reduction if self.in_full(share) else 1
@@ -127,29 +117,25 @@ class Schedule:
         return self.reduction * (2 if share <= self.settings.coarse_until else 1)
 
     def in_full(self, share: float) -> bool:
-        """Do steps look at windows of the photos as they are? Not at photos that a step can take
-        whole.
-        """
+        """True where steps look at windows of unreduced photos; never if whole ones are small."""
         return self.reduction > 1 and share > self.settings.fine_from
 
     def grown(self, share: float) -> int:
-        """How many times Gaussians were to be added until now."""
+        """Number of times that Gaussians were to be added until now."""
         return sum(share >= at for at in self.growth)
 
     def reset(self, share: float) -> int:
-        """How many times opacities were to fall until now."""
+        """Number of times that opacities were to fall until now."""
         return sum(share >= at for at in self.resets)
 
     def prunes(self, share: float) -> bool:
-        """Are Gaussians pruned?"""
+        """True once Gaussians are pruned."""
         return share >= self.settings.prune_from
 
     def has_grown(self, share: float) -> bool:
-        """Is growth over?"""
+        """True once growth is over."""
         return share >= self.settings.densify_until
 
     def freezes_bands(self, share: float) -> bool:
-        """Do SH bands stay as they are? Those that are to stay from the end on do so once the
-        training has ended.
-        """
+        """True once SH bands stay as they are; never in training where `sh_freeze` is 1."""
         return self.settings.sh_freeze < 1 and share >= self.settings.sh_freeze

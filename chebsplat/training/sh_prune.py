@@ -1,6 +1,4 @@
-"""SH pruning (Eq 13): nested band masks, and a penalty that spares the bands a region's colours
-need.
-"""
+"""SH pruning (Eq 13): nested band masks, and a penalty that spares bands that regions need."""
 
 from __future__ import annotations
 
@@ -24,9 +22,7 @@ def band_mask(logits: Tensor) -> Tensor:
 
 
 def masked_sh(shN: Tensor, mask: Tensor) -> Tensor:
-    """shN [N, K, 3] with each band multiplied by its mask [N, 3]; band 0 is not in shN and never
-    masked.
-    """
+    """shN [N, K, 3] with each band multiplied by its mask [N, 3]; band 0 is not in shN."""
     parts = [
         shN[:, a:b] * mask[:, i, None, None] for i, (a, b) in enumerate(BANDS) if a < shN.shape[1]
     ]
@@ -39,14 +35,12 @@ def degrees(mask: Tensor) -> Tensor:
 
 
 def ragged_rows(degree: Tensor) -> list[Tensor]:
-    """Which Gaussians, and in which order, have each band once every one keeps only those up to its
-    degree.
+    """Rows of the Gaussians that have each band, once every one keeps only those up to its degree.
 
     Args: degree u8 [N], 0 to 3.
     Returns: for bands 0 to 3, i64 [N_l]: the highest degree first and otherwise in their order, so
-      that each list
-      starts the one before: band l belongs to the first N_l Gaussians, and nothing has to point at
-        its rows.
+      that each list starts the one before: band l belongs to the first N_l Gaussians, and nothing
+      has to point at its rows.
     Raises: ValueError on a degree beyond 3.
     """
     if (degree > 3).any():
@@ -56,9 +50,7 @@ def ragged_rows(degree: Tensor) -> list[Tensor]:
 
 
 def dense(bands: list[Tensor], n: int) -> Tensor:
-    """shN [n, 15, 3] of bands 1, 2, ... [N_l, 2 l + 1, 3], zero where a Gaussian does not have a
-    band.
-    """
+    """shN [n, 15, 3] of bands 1, 2, ... [N_l, 2 l + 1, 3]; 0 where a Gaussian has none."""
     shN = bands[0].new_zeros(n, 15, 3) if bands else torch.zeros(n, 15, 3)
     for (first, last), band in zip(BANDS, bands, strict=False):
         shN[: len(band), first:last] = band
@@ -89,7 +81,7 @@ def soft_histogram(values: Tensor, valid: Tensor, n_bins: int, low: Tensor, high
 
 
 def band_colors(shN: Tensor, directions: Tensor) -> Tensor:
-    """What each band adds to the colour seen along a direction.
+    """Contribution of each band to the colour seen along a direction.
 
     Args: shN [N, K, 3]; directions [..., N, 3] unit (or [..., 1, 3] for one that all Gaussians
       share).
@@ -126,14 +118,13 @@ def guidance_directions() -> Tensor:
 
 @torch.no_grad()
 def region_guidance(shN: Tensor, members: Tensor, n: int, n_bins: int = 8) -> Tensor:
-    """Weight in (0, 1] of each band's penalty, [n, 3]; small where a region's colours need the band
-    (Eq 13).
+    """Weight in (0, 1] of each band's penalty, [n, 3], small where a region needs it (Eq 13).
 
     Args: shN [n, K, 3]; members i64 [M, k], -1 where padded; n_bins: odd numbers give a bin of no
       contribution, so one more is taken if it is even.
-    Choices: need is how far the soft histogram of the band's colours over the region's Gaussians,
-      seen from ten directions, lies from that without the band (all mass in the middle bin): total
-      variation t. The weight is 1 − t, at least 0.05, and no more than that of the bands above,
+    Choices: need is the total variation t between the soft histogram of the band's colours over
+      the region's Gaussians, seen from ten directions, and that without the band (all mass in the
+      middle bin). The weight is 1 − t, at least 0.05, and no more than that of the bands above,
       which a band's mask takes along. A colour counts by the channel it changes most, so that
       opposite changes of two channels do not cancel. The range is that of the region's strongest
       band, but the middle bin reaches at least half a grey level (1/510) either way: pixels blend
@@ -176,8 +167,7 @@ def region_guidance(shN: Tensor, members: Tensor, n: int, n_bins: int = 8) -> Te
 
 
 def sh_loss(mask: Tensor, guidance: Tensor | None = None, counted: Tensor | None = None) -> Tensor:
-    """Mean over Gaussians of Σ_l (2l + 1) m_l, each band weighted by `guidance` [N, 3] where given;
-    0 for none.
+    """Mean over Gaussians of Σ_l (2l + 1) m_l, weighted by any `guidance` [N, 3]; 0 of none.
 
     Args: counted bool [N]: the Gaussians that the mean is of; None: all.
     """

@@ -1,5 +1,5 @@
-"""One training: schedules, losses, growth and pruning of a scene model. Arrays in, arrays out; no
-files. `Laps` are its seconds by part.
+"""One training of a scene model: schedules, losses, growth and pruning. Arrays in, arrays out;
+`Laps` are its seconds by part.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class Trainer:
     Args:
       settings: resolved, nothing left open (`stages.training.defaults`).
       extent:   scene units, scales the means' learning rate.
-    The model's Gaussians say which device computes; views and cameras are to be there, too. On a
-    GPU one step in READ_EVERY waits for its figures, the others for nothing: within these a loss
-    that is not finite is found. `state_dict()` between two steps holds all that the steps to come
-    depend on: a trainer that loads it takes them as this one does, to the bit, with as many
-      threads.
+
+    The model's device computes; views and cameras must be there, too. On a GPU one step in
+    READ_EVERY waits for its figures, the others for nothing: within these a loss that is not finite
+    is found. `state_dict()` between two steps holds all that the steps to come depend on: a trainer
+    that loads it takes them as this one does, to the bit, with as many threads.
     """
 
     def __init__(self, model: SceneModel, views: Views, settings: TrainSection, extent: float):
@@ -77,15 +77,13 @@ class Trainer:
 
     @property
     def reads(self) -> bool:
-        """Whether this step's figures are numbers: every step's on the CPU; tensors wait for nobody
-        on a GPU.
+        """True where this step reads its figures as numbers: always on the CPU, while a GPU's
+        tensors are waited for at one step in READ_EVERY alone.
         """
         return self.model.device.type == "cpu" or self.step % READ_EVERY == 0
 
     def steps(self) -> Iterator[dict[str, float | Tensor]]:
-        """Train until the budget is spent; yields each step's figures, as tensors [] where it does
-        not read them.
-        """
+        """Train until the budget is spent; yields each step's figures, unread ones as tensors."""
         while self.share < 1:
             began = time.perf_counter()
             self.laps.start()
@@ -164,9 +162,7 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on as the trainer whose `state_dict()` this is; that one is not to be used
-        afterwards.
-        """
+        """Go on as the trainer whose `state_dict()` this is, which must not go on itself."""
         model = self.model
         model.raw = {name: value.requires_grad_(True) for name, value in state["raw"].items()}
         for name, module in model.modules.items():
@@ -193,9 +189,7 @@ class Trainer:
         self.laps.mark("refresh")
 
     def _guided(self, index: Tensor | None) -> Tensor | None:
-        """Weights [V, 3] of the bands' penalty, computed when first wanted after a refresh; None:
-        all alike.
-        """
+        """Weights [V, 3] of the bands' penalty, computed on demand; None: all alike."""
         if not self.settings.sh_guided:
             return None
         if self.guidance is None:
@@ -218,13 +212,10 @@ class Trainer:
                 for name, value in figures.items()
                 if not math.isfinite(value)
             ][1:]
-            where = (
-                f"step {self.step}, view {self.views.names[index]}: loss {', '.join(bad)} is "
-                "not finite"
-            )
+            cause = broken(self.model) or "all parameters are finite: look at the view itself"
             raise DataFailure(
-                f"{where}; "
-                f"{broken(self.model) or 'all parameters are finite: look at the view itself'}"
+                f"step {self.step}, view {self.views.names[index]}: loss {', '.join(bad)} is "
+                f"not finite; {cause}"
             )
         self.laps.mark("losses")
         self.optimizer.zero_grad(set_to_none=True)
@@ -242,8 +233,8 @@ class Trainer:
         return figures
 
     def _teaches(self, share: float) -> bool:
-        """Does this step teach features? It looks at a whole photo then, while others look at
-        windows: one in WHOLE at most.
+        """True where this step teaches features. It then looks at a whole photo, while others look
+        at windows: one in WHOLE at most.
         """
         every = (
             max(self.feature_every, WHOLE) if self.schedule.in_full(share) else self.feature_every
@@ -251,9 +242,7 @@ class Trainer:
         return self.views.features is not None and self.step % every == 0
 
     def _window(self, share: float) -> Window | None:
-        """The part of a photo, drawn at random, that this step sees as it is; None: the whole
-        photo, reduced.
-        """
+        """A random part of a photo that this step sees unreduced; None: all of it, reduced."""
         if not self.schedule.in_full(share) or self._teaches(share):
             return None
         (height, width), by = self.views.images.shape[1:3], self.schedule.reduction
@@ -272,87 +261,86 @@ class Trainer:
           all of it, reduced.
         """
         settings, factor = self.settings, self.schedule.factor(share) if window is None else 1
-        pruning, taught = self.schedule.prunes(share), self._teaches(share)
-        wanted = self.views.features(index) if taught and self.views.features is not None else None
-        placed = self.views.depth if self.step % settings.depth_every == 0 else None
-        surface = None if placed is None else placed(index, factor)
+        pruning, teaches = self.schedule.prunes(share), self._teaches(share)
+        target = self.views.features(index) if teaches and self.views.features is not None else None
+        read_depth = self.views.depth if self.step % settings.depth_every == 0 else None
+        surface = None if read_depth is None else read_depth(index, factor)
         if surface is not None and window is not None:
             surface = window.of(surface)
         rendered = self.model.render(
             self.views.camera(index, factor, window),
             self.schedule.degree(share),
             masked=pruning,
-            semantic=taught,
-            grid=None if wanted is None else (wanted.shape[0], wanted.shape[1]),
+            semantic=teaches,
+            grid=None if target is None else (target.shape[0], target.shape[1]),
             depth=surface is not None,
         )
         self.laps.mark("render")
         auxiliary, (photo, mask) = rendered.auxiliary, self.views.photo(index, window)
-        labels = None if wanted is None or self.views.labels is None else self.views.labels(index)
+        labels = None if target is None or self.views.labels is None else self.views.labels(index)
         guidance = None if auxiliary.band_masks is None else self._guided(rendered.index)
-        known = {
-            "photo": photo, "mask": mask, "rgb": rendered.rgb, "wanted": wanted,
+        optional = {
+            "photo": photo, "mask": mask, "rgb": rendered.rgb, "target": target,
             "features": rendered.features, "surface": surface, "planes": rendered.planes,
             "alpha": None if rendered.planes is None else rendered.alpha,
             "classes": labels and labels.classes, "confidence": labels and labels.confidence,
-            "class_codes": labels and labels.class_codes, "guidance": guidance, "soft_mask": auxiliary.soft_mask,
+            "class_codes": labels and labels.class_codes, "guidance": guidance,
+            "soft_mask": auxiliary.soft_mask,
             "band_masks": auxiliary.band_masks, "in_view": auxiliary.in_view,
             "delta": auxiliary.delta, "knowledge": auxiliary.knowledge,
         }  # fmt: skip
-        given = {name: value for name, value in known.items() if value is not None}
-        key = factor, tuple(given), labels is not None and labels.complete
+        inputs = {name: value for name, value in optional.items() if value is not None}
+        key = factor, tuple(inputs), labels is not None and labels.complete
         return rendered, self.model.replay(
-            key, partial(self._losses, *key), [], list(given.values())
+            key, partial(self._losses, *key), [], list(inputs.values())
         )
 
     def _losses(
         self, factor: int, names: Sequence[str], complete: bool, *tensors: Tensor
     ) -> dict[str, Tensor]:
         """As `losses_of`, of tensors by their names there (docs/method.md, section 8)."""
-        settings, backend, given = (
+        settings, backend, inputs = (
             self.settings,
             self.model.backend,
             dict(zip(names, tensors, strict=True)),
         )
-        target, mask = reduced(given["photo"], given.get("mask"), factor)
-        losses = {"color": photometric(given["rgb"], target, mask, WEIGHT_SSIM, backend)}
-        if "features" in given:
+        target, mask = reduced(inputs["photo"], inputs.get("mask"), factor)
+        losses = {"color": photometric(inputs["rgb"], target, mask, WEIGHT_SSIM, backend)}
+        if "features" in inputs:
             labels = None
-            if "classes" in given:
+            if "classes" in inputs:
                 labels = TaughtLabels(
-                    given["classes"], given["confidence"], given["class_codes"], complete
+                    inputs["classes"], inputs["confidence"], inputs["class_codes"], complete
                 )
             losses["features"] = semantic_loss(
-                given["features"], given["wanted"], labels, mask, settings, backend
+                inputs["features"], inputs["target"], labels, mask, settings, backend
             )
         if isinstance(self.model, PrintedScene):
-            parts = given.get("soft_mask"), given.get("delta"), given.get("knowledge")
+            parts = inputs.get("soft_mask"), inputs.get("delta"), inputs.get("knowledge")
             losses |= auxiliary_losses(parts, (settings.weight_mask, settings.weight_sh))
         else:
-            if "soft_mask" in given:
+            if "soft_mask" in inputs:
                 losses["mask"] = settings.weight_mask * sh_prune.mean_of(
-                    given["soft_mask"], given.get("in_view")
+                    inputs["soft_mask"], inputs.get("in_view")
                 )
-            if "band_masks" in given:
+            if "band_masks" in inputs:
                 cost = sh_prune.sh_loss(
-                    given["band_masks"], given.get("guidance"), given.get("in_view")
+                    inputs["band_masks"], inputs.get("guidance"), inputs.get("in_view")
                 )
                 losses["sh"] = settings.weight_sh * cost
-        if "planes" in given:
+        if "planes" in inputs:
             distance = depth_distance(
-                at_pixels(given["planes"]), given["alpha"], given["surface"], mask
+                at_pixels(inputs["planes"]), inputs["alpha"], inputs["surface"], mask
             )
             losses["depth"] = self.weight_depth * distance
         loss = torch.stack(list(losses.values())).sum()
-        if settings.densify_semantic:  # nobody asks for the gradient of one alone
+        if settings.densify_semantic:  # no gradient of one alone is needed
             losses = {name: value.detach() for name, value in losses.items()}
         return {"loss": loss} | {f"loss_{name}": value for name, value in losses.items()}
 
     @torch.no_grad()
     def held_in_psnr(self, indices: list[int]) -> float:
-        """Mean PSNR over training views at full resolution, dB, of which a pixel counts; 0 if none
-        does.
-        """
+        """Mean PSNR, dB, of training views' counted pixels at full resolution; 0 of none."""
         scores = []
         for index in indices:
             camera, degree = self.views.camera(index, 1), self.schedule.degree(self.share)
@@ -385,9 +373,7 @@ class Trainer:
 
 
 class Laps:
-    """Seconds by part of the work: each `mark` books the time since the mark or the start before
-    it.
-    """
+    """Seconds by part of the work: each `mark` books the time since the last mark or start."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

@@ -1,6 +1,4 @@
-"""The `chebsplat` command: runs, plans, studies, upkeep, uses of a finished scene, and every stage
-as a command.
-"""
+"""The `chebsplat` command: runs, plans, studies, upkeep, uses of a finished scene, every stage."""
 
 from __future__ import annotations
 
@@ -12,22 +10,20 @@ import click
 
 from chebsplat.formats.splats import is_splat
 from chebsplat.pipelines.cli import about, knowledge, renders, runs, upkeep, uses
-from chebsplat.pipelines.cli.group import Guarded, logged, say
+from chebsplat.pipelines.cli.group import VERBOSELY, Guarded, log_to_stderr, say
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.stopping import streams
 
 
 class Commands(Guarded):
-    """Stages are listed from their table and imported only when called, so that --help stays
-    instant.
-    """
+    """Lists stages from their table and imports one when it is called: --help stays instant."""
 
     def main(self, *arguments: Any, **options: Any) -> Any:
         with streams(say):
             return super().main(*arguments, **options)
 
     def invoke(self, context: click.Context) -> NoReturn:
-        with logged(context):
+        with log_to_stderr(context):
             super().invoke(context)
 
     def list_commands(self, context: click.Context) -> list[str]:
@@ -43,7 +39,7 @@ class Commands(Guarded):
         of_a_file = any(
             word.startswith(("--capture", "--as")) or is_splat(word) for word in args[1:]
         ) or (len(args) > 1 and not args[1].startswith("-"))
-        # `lift` is of a file, `export` of a finished scene, too
+        # `lift` is also a command on files, `export` on a finished scene
         if args[0] in STAGES and not (of_a_file and args[0] in self.commands):
             from chebsplat.stages.runtime.command import command
 
@@ -52,11 +48,11 @@ class Commands(Guarded):
 
 
 def run_stage(name: str, job: Any) -> None:
-    """Import a stage's module only now, since it brings torch, and run it."""
+    """Import a stage's module, which brings torch, and run it."""
     import_module(f"chebsplat.stages.{name}").run(job)
 
 
-@click.group(cls=Commands, params=[about.VERSION])
+@click.group(cls=Commands, params=[about.VERSION, VERBOSELY])
 def main() -> None:
     """Semantic 3D Gaussian Splatting that understands shape."""
 

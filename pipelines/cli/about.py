@@ -1,4 +1,4 @@
-"""What there is before anything runs: names, settings, versions."""
+"""Commands that need no run: names, settings, versions."""
 
 from __future__ import annotations
 
@@ -11,18 +11,16 @@ import click
 
 from chebsplat.errors import ConfigError
 
-WIDEST = 36  # characters of a column of ranges
+WIDEST = 36  # characters of the column of ranges
 
 
 @click.command()
 def scenes() -> None:
-    """List the scenes, ablations, sequences and studies that have a name, and scenes whose data
-    must be brought.
-    """
+    """List named scenes, ablations, sequences and studies, and scenes whose data is missing."""
     from chebsplat.pipelines.work.scenes import data_of, names
     from chebsplat.pipelines.work.summary import show_rows
 
-    needed = {name: found for name in names("scenes") if (found := data_of(name))}
+    needed = {name: location for name in names("scenes") if (location := data_of(name))}
     print(f"scenes: {' '.join(name for name in names('scenes') if name not in needed)}")
     print("scenes of data that is no part of chebsplat:")
     there = {
@@ -39,28 +37,28 @@ def scenes() -> None:
 def settings(section: str | None) -> None:
     """List every setting (of a SECTION, or one section.key): name, default, range, meaning."""
     from chebsplat.formats.names import suggest
-    from chebsplat.pipelines.work.scenes import shown
+    from chebsplat.pipelines.work.scenes import escape_text
     from chebsplat.pipelines.work.summary import show_rows
     from chebsplat.stages.runtime.config import Config, known_keys
 
-    asked = section or ""
-    chosen = [key for key in known_keys() if not asked or asked in (key, key.partition(".")[0])]
-    if not chosen:
-        near = suggest(asked, [*Config.model_fields, *known_keys()])
-        raise ConfigError(f"no setting or section is called {shown(asked)}; did you mean "
+    query = section or ""
+    keys = [key for key in known_keys() if not query or query in (key, key.partition(".")[0])]
+    if not keys:
+        near = suggest(query, [*Config.model_fields, *known_keys()])
+        raise ConfigError(f"no setting or section is called {escape_text(query)}; did you mean "
                           f"{', '.join(near or Config.model_fields)}?")  # fmt: skip
     rows, schema = [], Config.model_json_schema()
-    for key in chosen:
+    for key in keys:
         part, _, name = key.partition(".")
         section_of: Any = Config.model_fields[part].annotation
         field = schema["$defs"][section_of.__name__]["properties"][name]
         values, meaning, default = range_of(field), field["description"], field.get("default")
         if len(values) > WIDEST:
             values, meaning = "see right", f"{meaning}; one of {values}"
-        shown_default = (
+        default_text = (
             "-" if default is None else default if isinstance(default, str) else json.dumps(default)
         )
-        rows.append((key, shown_default, values, meaning))
+        rows.append((key, default_text, values, meaning))
     show_rows([("setting", "default", "range", "meaning"), *rows])
 
 
@@ -76,11 +74,9 @@ def range_of(field: dict[str, Any]) -> str:
     )
 
 
-def version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
-    """Of chebsplat, of the packages that its kernels are compiled with, and the commit of a
-    checkout.
-    """
-    if not wanted or context.resilient_parsing:
+def version(context: click.Context, _: click.Parameter, flag: bool) -> None:
+    """Print versions of chebsplat and of its compilers' packages, and the commit of a checkout."""
+    if not flag or context.resilient_parsing:
         return
 
     from chebsplat.pipelines.running.run import HERE, git_state
@@ -99,6 +95,12 @@ def version(context: click.Context, _: click.Parameter, wanted: bool) -> None:
     context.exit()
 
 
-VERSION = click.Option(["--version"], is_flag=True, is_eager=True, expose_value=False, callback=version,
-                       help="Versions of chebsplat, torch, numba and Python, and exit.")  # fmt: skip
+VERSION = click.Option(
+    ["--version"],
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=version,
+    help="Versions of chebsplat, torch, numba and Python, and exit.",
+)
 COMMANDS = (scenes, settings)

@@ -1,6 +1,5 @@
-"""Logging and exit codes of commands: the log goes to stderr; what a command returns is its exit
-code; a typed error or a stop becomes a line on stderr and a code. Options that several commands
-take.
+"""Logging, exit codes and shared options of commands: the log goes to stderr; a command's result is
+its exit code; a typed error or a stop becomes a line on stderr and a code.
 """
 
 from __future__ import annotations
@@ -19,13 +18,20 @@ import numpy as np
 
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines.work import store
+from chebsplat.stages.runtime.progress import VERBOSE, log_level
 from chebsplat.stages.runtime.stopping import exit_code
 
 
 def say(text: str) -> None:
     """Print a line of ours to stderr, where that is possible."""
-    with suppress(OSError):  # the terminal may be gone, and the disk of a log full
+    with suppress(OSError):  # the terminal may be closed, or the log's disk full
         print(f"chebsplat: {text}", file=sys.stderr)
+
+
+def be_verbose(_context: click.Context, _: click.Parameter, flag: bool) -> None:
+    """Show details on the console, of this process and of those that it starts."""
+    if flag:
+        os.environ[VERBOSE] = "1"
 
 
 class _Lines(logging.Formatter):
@@ -40,13 +46,11 @@ class _Lines(logging.Formatter):
 
 
 @contextmanager
-def logged(context: click.Context) -> Iterator[None]:
-    """Send the log to stderr within; a stage that is run there says it in its own way from then
-    on.
-    """
+def log_to_stderr(context: click.Context) -> Iterator[None]:
+    """Send the log to stderr within the block; a stage's command formats it in its own way."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Lines(context))
-    logging.getLogger("chebsplat").setLevel("INFO")
+    logging.getLogger("chebsplat").setLevel(log_level())
     logging.getLogger().addHandler(handler)
     try:
         yield
@@ -58,7 +62,7 @@ class Guarded(click.Group):
     """A group whose commands return an exit code (nothing: 0) and may raise typed errors."""
 
     def invoke(self, context: click.Context) -> NoReturn:
-        gone = (BrokenPipeError,)  # whoever read stdout: click ends without a word
+        gone = (BrokenPipeError,)  # stdout's reader has gone: click ends silently
         context.exit(exit_code(partial(super().invoke, context), store.work(), say, gone))
 
     def list_commands(self, context: click.Context) -> list[str]:
@@ -67,9 +71,7 @@ class Guarded(click.Group):
 
 
 class NewPath(click.ParamType):
-    """A file, of one of these suffixes where there are any, or a folder: made, never written
-    over.
-    """
+    """A file (of one of these suffixes, if any) or a folder to make; it must not exist yet."""
 
     name = "path"
 
@@ -95,17 +97,17 @@ class Upward(click.ParamType):
             return value
         sign, axis = ("", value) if value[:1] not in ("+", "-") else (value[0], value[1:])
         try:
-            found = np.array([float(part) for part in value.split(",")])
+            vector = np.array([float(part) for part in value.split(",")])
         except ValueError:
-            found = np.eye(3)["xyz".index(axis)] if axis in ("x", "y", "z") else np.zeros(0)
-            found = -found if sign == "-" else found
-        length = np.linalg.norm(found)
-        if found.shape != (3,) or not 0 < length < np.inf:
+            vector = np.eye(3)["xyz".index(axis)] if axis in ("x", "y", "z") else np.zeros(0)
+            vector = -vector if sign == "-" else vector
+        length = np.linalg.norm(vector)
+        if vector.shape != (3,) or not 0 < length < np.inf:
             raise ConfigError(
                 f"--up {value}: x, y or z with a sign, three numbers such as 0,0,1, "
                 "or auto is needed"
             )
-        return found / length
+        return vector / length
 
 
 class Phrases(click.ParamType):
@@ -117,6 +119,14 @@ class Phrases(click.ParamType):
         return [word.strip() for word in value.split(",") if word.strip()]
 
 
+VERBOSELY = click.Option(
+    ["-v", "--verbose"],
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=be_verbose,
+    help="Say what a scene leaves out, and other details.",
+)
 UP = click.option(
     "--up",
     type=Upward(),
@@ -127,5 +137,5 @@ AGAINST = click.option(
     "--against",
     type=Phrases(),
     default="",
-    help="phrases it is weighed against; default: object,things,stuff,texture",
+    help="phrases to compare with; default: object,things,stuff,texture",
 )

@@ -1,6 +1,4 @@
-"""What scenes start from: the lessons of a set, what each is trusted, taking one out, and a new
-encoder.
-"""
+"""Commands on sets of lessons: list, verify, forget, learn again; and a new encoder of shape."""
 
 from __future__ import annotations
 
@@ -19,15 +17,13 @@ NAME = click.option(
 
 @click.group()
 def knowledge() -> None:
-    """What scenes start from, and what they have taught: show, verify, forget, rebuild; teach a new
-    encoder.
-    """
+    """Lessons and encoder that scenes start from: show, verify, forget, rebuild, teach anew."""
 
 
 @knowledge.command()
 @NAME
 def log(name: str) -> None:
-    """The lessons of a set, in the order that they were added in."""
+    """The lessons of a set, in the order in which they were added."""
     from chebsplat.pipelines.work import heads
 
     for key, record in sorted(heads.members(name).items(), key=lambda entry: entry[1]["date"]):
@@ -37,10 +33,10 @@ def log(name: str) -> None:
 @knowledge.command()
 @NAME
 def show(name: str) -> None:
-    """What each lesson of a set teaches, how far it is trusted, and why."""
+    """Points, novelty and trust of each lesson of a set, and the reason for its trust."""
     from chebsplat.formats.lesson import read_notes
     from chebsplat.pipelines.work import heads
-    from chebsplat.pipelines.work.summary import aligned
+    from chebsplat.pipelines.work.summary import align_columns
     from chebsplat.stages.recall import trusted, why
 
     rows = [("lesson", "scene", "points", "novelty", "trust", "because")]
@@ -48,7 +44,7 @@ def show(name: str) -> None:
         notes = read_notes(heads.folder(name) / key)
         figures = f"{notes['n_points']}", f"{notes['novelty']:.3f}", f"{trusted(notes):.2f}"
         rows.append((key, record["scene"], *figures, why(notes)))
-    for line in aligned(rows):
+    for line in align_columns(rows):
         print(line)
 
 
@@ -60,19 +56,17 @@ def verify(name: str) -> None:
     from chebsplat.formats.lesson import SCHEMA
     from chebsplat.pipelines.work import heads
 
-    held = heads.members(name)
-    for key in held:
+    lessons = heads.members(name)
+    for key in lessons:
         artifact.verify(heads.folder(name) / key, SCHEMA)
-    print(f"{name}: {len(held)} lessons, whole")
+    print(f"{name}: {len(lessons)} lessons, whole")
 
 
 @knowledge.command()
 @click.argument("lesson")
 @NAME
 def forget(lesson: str, name: str) -> None:
-    """Take a LESSON out of a set: scenes that are pinned from now on start as if it had never been
-    learned.
-    """
+    """Take a LESSON out of a set: scenes that are pinned from now on start without it."""
     from chebsplat.pipelines.work import heads
 
     heads.forget(name, lesson)
@@ -83,19 +77,17 @@ def forget(lesson: str, name: str) -> None:
 @NAME
 @click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
 def rebuild(name: str, cores: int) -> int:
-    """Learn every lesson of a set again, by the encoder that ships now, from artifacts that are
-    there.
-    """
+    """Learn every lesson of a set again by the encoder that ships now, from stored artifacts."""
     from chebsplat.pipelines.planning.plan import Planner
-    from chebsplat.pipelines.planning.sequences import relearning
+    from chebsplat.pipelines.planning.sequences import plan_relearning
     from chebsplat.pipelines.running.run import execute
 
     planner = Planner(running=True)
     try:
-        chosen = relearning(planner, name)
+        lesson_plans = plan_relearning(planner, name)
     finally:
         planner.save()
-    return execute(chosen, "learn", cores) if chosen else 0
+    return execute(lesson_plans, "learn", cores) if lesson_plans else 0
 
 
 @knowledge.command()
@@ -106,25 +98,23 @@ def rebuild(name: str, cores: int) -> int:
 @click.option("--out", type=NewPath(), help="folder to copy it to; later: --knowledge FOLDER/")
 @click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
 def teach(teacher: Path | None, settings: str, out: Path | None, cores: int) -> int:
-    """Teach an encoder what shapes look like to a TEACHER, over generated rooms; its scenes start
-    from it.
-    """
+    """Train an encoder of shape for a TEACHER on generated rooms; its scenes start from it."""
     from chebsplat.formats import artifact
     from chebsplat.pipelines.planning.plan import Planner
-    from chebsplat.pipelines.planning.sequences import teaching
+    from chebsplat.pipelines.planning.sequences import plan_teaching
     from chebsplat.pipelines.running.run import execute
     from chebsplat.pipelines.work import store
 
     planner = Planner(running=True)
     try:
         store.make_work()
-        plan = teaching(planner, teacher, settings)
+        plan = plan_teaching(planner, teacher, settings)
     finally:
         planner.save()
     code = execute([plan], "teach", cores)
     if code == 0 and out is not None:
-        made = plan.targets["teach"]
-        artifact.copy(made, out, artifact.verify(made))
+        published = plan.targets["teach"]
+        artifact.copy(published, out, artifact.verify(published))
         print(out.absolute())
     return code
 
@@ -140,18 +130,17 @@ def teach(teacher: Path | None, settings: str, out: Path | None, cores: int) -> 
 @NAME
 @click.option("--cores", type=click.IntRange(1), default=os.cpu_count())
 def teach_points(scene: str, points: Path, name: str, cores: int) -> int:
-    """Teach other scenes what labelled points of a SCENE are: its lesson is of these, in place of
-    its teacher's.
+    """Teach other scenes from labelled points of a SCENE instead of its 2D teacher's labels.
 
     Without a SCENE, the stage of this name: --help says more.
     """
     from chebsplat.pipelines.running.run import execute
     from chebsplat.pipelines.selection import checked_stage, plans
 
-    chosen = plans(
+    scene_plans = plans(
         scene, None, {"learn": {"points": str(points)}}, "", running=True, knowledge=name
     )
-    return execute(chosen, checked_stage("learn", chosen), cores)
+    return execute(scene_plans, checked_stage("learn", scene_plans), cores)
 
 
 COMMANDS = (knowledge, teach_points)

@@ -11,20 +11,18 @@ from typing import Any
 
 import click
 
-from chebsplat.errors import InputError
+from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.splats import is_splat
 from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath
 
-PATH = click.option(
-    "--path",
-    default="capture",
-    show_default=True,
-    help="orbit, capture, or a cameras.json or transforms.json",
-)
+VIDEO = ".mp4"
+PATHS = "flight (along the capture's cameras, smoothed and level; of a splat alone within it), \
+orbit, capture, or a cameras.json or transforms.json"
 FRAMES = click.option(
     "--frames",
     type=click.IntRange(1, 100_000),
-    help="of an orbit (default: 120), or of a flight through other cameras (default: none)",
+    help="of an orbit (default: 120) or a flight (by its length), or of a path through other "
+    "cameras (default: none)",
 )
 SIZE = click.option(
     "--size", help="WIDTHxHEIGHT in pixels, such as 1280x960; default: the cameras' own"
@@ -43,26 +41,43 @@ WORDS = click.option(
 )
 
 
+class FramesPath(click.ParamType):
+    """A folder, which has no ending, or a video, whose ending is .mp4."""
+
+    name = "path"
+
+    def convert(self, value: Any, param: Any, context: click.Context | None) -> Path:
+        path = Path(value)
+        if path.suffix[1:2].isalpha() and path.suffix.lower() != VIDEO and not path.is_dir():
+            raise ConfigError(
+                f"{path}: frames go into a folder, whose name has no ending, or into a video that "
+                f"ends in {VIDEO}; choose another --out"
+            )
+        return path
+
+
 @click.command()
 @click.argument("scene")
-@PATH
+@click.option(
+    "--path",
+    default="auto",
+    help=f"{PATHS}; default: orbit where the cameras look inwards, else flight",
+)
 @FRAMES
 @UP
 @click.option(
     "--what",
     default="color",
     show_default=True,
-    help="of color,labels,depth,relevancy; with commas",
+    help="color,labels,depth,relevancy, or some of these",
 )
-@click.option("--query", help="words that relevancy is of")
+@click.option("--query", help="words of the relevancy")
 @AGAINST
 @SIZE
 @click.option(
     "--fps", type=click.IntRange(1, 240), default=24, show_default=True, help="of a video"
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), required=True, help="a folder of frames, or a .mp4"
-)
+@click.option("--out", type=FramesPath(), required=True, help="a folder of frames, or a .mp4")
 def render(
     scene: str,
     path: str,
@@ -72,24 +87,25 @@ def render(
     size: str | None,
     fps: int,
     out: Path,
-    **asked: Any,
+    **of_query: Any,
 ) -> None:
-    """Render a finished SCENE along a path of cameras, as frames or a video; frames that are there
-    are kept.
-    """
+    """Render a finished SCENE along a path of cameras, as frames or a video; old frames stay."""
     from chebsplat.formats.artifact import read_manifest
     from chebsplat.pipelines.api import load
     from chebsplat.pipelines.work.finished import artifact_of
     from chebsplat.stages.runtime.progress import Progress
     from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
-    from chebsplat.stages.tools.frames import Shot, kinds_of, render_frames, render_video
+    from chebsplat.stages.tools.frames import Shot, kinds_of, library, render_frames, render_video
 
-    opened, pixels, query = load(scene), size_of(size), asked["query"]
+    is_video = out.suffix.lower() == VIDEO
+    if is_video:
+        library()  # fails on a missing extra before a scene is opened
+    opened, pixels, query = load(scene), size_of(size), of_query["query"]
     kinds = kinds_of(what, opened, query is not None)
-    query_vectors = None if query is None else opened.understood(query, asked["against"])
+    query_vectors = None if query is None else opened.understood(query, of_query["against"])
     shot = Shot(kinds, read_manifest(artifact_of(scene, "export")).key, query_vectors)
     cameras = [fitted(camera, pixels) for camera in path_of(opened, path, frames, up)]
-    if out.suffix == ".mp4":
+    if is_video:
         render_video(opened, cameras, shot, out, fps, Progress())
     else:
         render_frames(opened, cameras, shot, out, Progress())
@@ -98,7 +114,7 @@ def render(
 
 @click.command()
 @click.argument("scene")
-@PATH
+@click.option("--path", default="capture", show_default=True, help=PATHS)
 @FRAMES
 @UP
 @SIZE
@@ -108,9 +124,7 @@ def render(
 def cameras(
     scene: str, path: str, frames: int | None, up: Any, size: str | None, out: Path
 ) -> None:
-    """Write the cameras of a SCENE as COLMAP's text model, transforms.json and 3DGS'
-    cameras.json.
-    """
+    """Write a SCENE's cameras as COLMAP's text model, transforms.json and 3DGS' cameras.json."""
     from chebsplat.pipelines.api import load
     from chebsplat.stages.tools.camera_files import write_cameras
     from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
@@ -130,9 +144,7 @@ def cameras(
 @AGAINST
 @UP
 def page(scene: str, out: Path, sh: int, words: Path | None, against: list[str], up: Any) -> None:
-    """Write a finished SCENE (or a splat) as one HTML page to fly through and ask in words: no
-    server, no network.
-    """
+    """Write a finished SCENE (or a splat) as one HTML page to fly through and query."""
     _write_page(scene, out, sh, words, against, up)
 
 
@@ -157,7 +169,9 @@ def view(scene: str, sh: int, words: Path | None, against: list[str], up: Any) -
     out = out.absolute()
     _write_page(scene, out, sh, words, against, up)
     graphical = any(map(os.environ.get, ("BROWSER", "DISPLAY", "WAYLAND_DISPLAY")))
-    if not (graphical and webbrowser.open(out.as_uri())):  # without a screen it may be one of text
+    if not (
+        graphical and webbrowser.open(out.as_uri())
+    ):  # without a screen it may be a text browser
         print("no browser can be opened from here; open this file in one", file=sys.stderr)
 
 

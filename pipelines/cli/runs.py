@@ -1,6 +1,4 @@
-"""Running and planning: scenes, sequences, studies, and the one step that is a job of
-Snakemake's.
-"""
+"""Commands that run and plan: scenes, sequences, studies, and the job that Snakemake calls."""
 
 from __future__ import annotations
 
@@ -16,7 +14,7 @@ from chebsplat.stages.runtime.device import DEVICES
 
 OPTIONS = [
     click.option("--scene", help="a name from `chebsplat scenes`, a folder, or a video"),
-    click.option("--sequence", help="scenes in order, each with what those before it taught"),
+    click.option("--sequence", help="scenes in order, each with the lessons of those before it"),
     click.option("--set", "settings", default="", help="section.key=value,..."),
     click.option(
         "--quality",
@@ -27,12 +25,12 @@ OPTIONS = [
     click.option(
         "--knowledge",
         default="",
-        help="what it starts from: none, shipped, a set of lessons, a folder/",
+        help="starting knowledge: none, shipped, a set of lessons, a folder/",
     ),
     click.option(
         "--newer",
         is_flag=True,
-        help="start from the lessons that there are now, and stay with these",
+        help="pin the scene to the present lessons",
     ),
 ]
 
@@ -67,28 +65,34 @@ def run(stage: str | None, cores: int | None, device: str, on: str, **choice: An
     from chebsplat.pipelines.running.run import device_of, execute
 
     where = cluster.checked(on)
-    used = device_of(device, where)
+    computing = device_of(device, where)
     cores = cores or (os.cpu_count() or 1 if where == cluster.LOCAL else 4)
     from chebsplat.pipelines.selection import checked_stage, plans
 
-    chosen = plans(**choice, running=True, device=used)
-    return execute(chosen, checked_stage(stage or None, chosen), cores, used, where)
+    scene_plans = plans(**choice, running=True, device=computing)
+    return execute(scene_plans, checked_stage(stage or None, scene_plans), cores, computing, where)
 
 
 @click.command()
 @with_scene
 @ON_DEVICE
 def plan(device: str, **choice: Any) -> None:
-    """Show what would run, what is fresh, and what the scene leaves out, and why."""
+    """Show how long a scene takes, its steps to run, the fresh ones, and those left out."""
+    from chebsplat.pipelines.planning.forecast import forecast, sentence
     from chebsplat.pipelines.running.run import device_of
     from chebsplat.pipelines.selection import plans
 
-    chosen = plans(**choice, device=device_of(device))
-    for one in chosen:
-        print(f"{one.title}: {one.source}")
-        for step in one.steps:
-            print(f"  {'fresh' if step.fresh else 'would run':9s} {step.stage:9s} {step.key}")
-        for what, why in one.left_out.items():
+    used, cores = device_of(device), os.cpu_count() or 1
+    for scene_plan in plans(**choice, device=used):
+        stale = [step for step in scene_plan.steps if not step.fresh]
+        expected = forecast(scene_plan, stale, cores, used)
+        print(f"{scene_plan.title}: {sentence(scene_plan, expected, cores, used)}")
+        print(f"{scene_plan.title}: {scene_plan.source}")
+        for step in scene_plan.steps:
+            state = "fresh" if step.fresh else "would run"
+            time = f"{expected.seconds[step.stage]:6.0f} s" if expected and not step.fresh else ""
+            print(f"  {state:9s} {step.stage:9s} {step.key}{time}")
+        for what, why in scene_plan.left_out.items():
             print(f"  left out  {what}: {why}")
 
 
@@ -101,8 +105,8 @@ def plan(device: str, **choice: Any) -> None:
 )
 @click.option("--threads", type=click.IntRange(1), default=2, show_default=True, help="of each job")
 @click.option("--out", type=click.Path(path_type=Path), help="default: build/studies/NAME")
-@click.option("--plan", "only_plan", is_flag=True, help="say what would run, and stop")
-@click.option("--no-run", is_flag=True, help="write the tables of what is there, and run nothing")
+@click.option("--plan", "only_plan", is_flag=True, help="list the steps to run, and stop")
+@click.option("--no-run", is_flag=True, help="write the tables of finished runs, and run nothing")
 @ON_DEVICE
 @ON
 def study(
@@ -115,18 +119,16 @@ def study(
     device: str,
     on: str,
 ) -> int:
-    """Run a study (of pipelines/configs/studies, or a .toml): its table, figure and page; goes on
-    where it stopped.
-    """
+    """Run or resume a study (of pipelines/configs/studies, or a .toml): table, figure and page."""
     from chebsplat.pipelines.running import cluster
     from chebsplat.pipelines.running.run import Outcome, device_of, say
     from chebsplat.pipelines.studies import page, published, results, tables
     from chebsplat.pipelines.studies import study as studies
 
-    where, asked = cluster.checked(on), studies.read_study(name)
+    where, spec = cluster.checked(on), studies.read_study(name)
     computing = device_of(device, where)
     cores = cores or (os.cpu_count() or 1 if where == cluster.LOCAL else 100 * threads)
-    runs = studies.expand(asked, running=not (only_plan or no_run), device=computing)
+    runs = studies.expand(spec, running=not (only_plan or no_run), device=computing)
     say(
         f"{name}: {len(runs)} runs, {sum(run.plan.targets['evaluate'].is_dir() for run in runs)} "
         "of them done"
@@ -134,20 +136,20 @@ def study(
     if only_plan:
         print(studies.describe(studies.outstanding(runs)))
         return 0
-    used = min(threads, cores)
+    job_threads = min(threads, cores)
     folder = out or Path("build/studies") / Path(name).stem
-    command = f"make study={quote(name)} cores={cores} threads={used}"
+    command = f"make study={quote(name)} cores={cores} threads={job_threads}"
     command += f" on={quote(on)}" if where != cluster.LOCAL else ""
 
     def write(failed: dict[str, tuple[int, str, Path]]) -> Path:
         rows = [results.row_of(run, failed) for run in runs]
-        more = [*published.published_sections(asked, rows), *tables.sections(asked, rows)]
-        return page.write(folder, asked, runs, rows, command, more).absolute()
+        more = [*published.published_sections(spec, rows), *tables.sections(spec, rows)]
+        return page.write(folder, spec, runs, rows, command, more).absolute()
 
     outcome = Outcome()
     if not no_run:
         outcome = studies.execute(
-            Path(name).stem, runs, cores, used, computing, where, lambda: write({})
+            Path(name).stem, runs, cores, job_threads, computing, where, lambda: write({})
         )
     print(write(outcome.failed))
     return outcome.code
@@ -163,11 +165,11 @@ def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
     """Steps of a plan, one after the other until one fails, as Snakemake runs them."""
     from chebsplat.pipelines.running import job as jobs
     from chebsplat.pipelines.running.cluster import watch_run
-    from chebsplat.pipelines.running.processes import in_turn
+    from chebsplat.pipelines.running.processes import run_in_turn
 
     jobs.use_threads()
     if len(keys) > 1:
-        return in_turn(
+        return run_in_turn(
             _main, [["job", *["--elsewhere"] * elsewhere, str(plan), key] for key in keys]
         )
     if elsewhere:
@@ -178,18 +180,16 @@ def job(plan: Path, keys: tuple[str, ...], elsewhere: bool) -> int:
 @click.command(hidden=True)
 @click.option("--semantic", is_flag=True)
 def rehearse(semantic: bool) -> int:
-    """Compile what a training needs, as long as the run lasts that this is of."""
-    from chebsplat.pipelines.running.precompile import rehearsed
+    """Compile the kernels of a training while the run that calls this lasts."""
+    from chebsplat.pipelines.running.precompile import precompile
 
     os.nice(5)
-    with rehearsed(2, semantic):
+    with precompile(2, semantic):
         return 0
 
 
 def _main(arguments: list[str]) -> None:
-    """Our command in a process that was forked for it; by name, since it is the command that holds
-    those of here.
-    """
+    """The command, run in a forked process; imported by name, since it imports this module."""
     import_module("chebsplat.pipelines.cli").main(arguments, prog_name="chebsplat")
 
 

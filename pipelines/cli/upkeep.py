@@ -1,4 +1,4 @@
-"""What lies in work: scenes, digests, what nothing names any more, and how to be rid of either."""
+"""Commands on the work folder: list, verify and remove scenes, and what no scene names."""
 
 from __future__ import annotations
 
@@ -24,16 +24,14 @@ class Age(click.ParamType):
     ) -> float:
         if isinstance(value, float):
             return value
-        if not (found := re.fullmatch(r"(\d{1,6})([mhdw])", value)):
+        if not (match := re.fullmatch(r"(\d{1,6})([mhdw])", value)):
             self.fail(f"{value!r} is no age such as 30m, 12h, 7d or 4w", param, context)
-        return float(found[1]) * UNITS[found[2]]
+        return float(match[1]) * UNITS[match[2]]
 
 
 @click.command("ls")
 def list_scenes() -> None:
-    """List scenes, studies and sequences in work: source, stages done, bytes, when, and what was
-    measured.
-    """
+    """List scenes, studies and sequences in work: source, stages, bytes, date and figures."""
     from chebsplat.pipelines.work import inventory, store
     from chebsplat.pipelines.work.summary import show_rows
 
@@ -52,9 +50,9 @@ def rm(scenes: tuple[str, ...], yes: bool) -> None:
     """Remove SCENES: their links and pages, and the artifacts that nothing else names."""
     from chebsplat.pipelines.work import inventory
 
-    chosen = list(dict.fromkeys(inventory.in_work(scene) for scene in scenes))
-    artifacts = inventory.only_of(chosen)
-    for folder in chosen:
+    folders = list(dict.fromkeys(inventory.in_work(scene) for scene in scenes))
+    artifacts = inventory.list_exclusive(folders)
+    for folder in folders:
         foreign = inventory.others(folder)
         print(
             f"           {folder}"
@@ -62,27 +60,25 @@ def rm(scenes: tuple[str, ...], yes: bool) -> None:
         )
     show_sizes(artifacts, yes, "--yes removes them")
     if yes:
-        remove(chosen, artifacts)
+        remove(folders, artifacts)
 
 
-def remove(chosen: list[Path], artifacts: list[tuple[Path, int]]) -> None:
+def remove(folders: list[Path], artifacts: list[tuple[Path, int]]) -> None:
     """Remove the links of these folders, and these artifacts and leftovers."""
     from chebsplat.pipelines.work import inventory, store
 
-    for folder in chosen:
+    for folder in folders:
         inventory.unlink(folder)
     for path, _ in artifacts:
         store.remove(path)
 
 
-def show_sizes(sizes: list, done: bool, advice: str) -> None:
-    """Print folders with their sizes in MB, and the total; `advice` says what to do, unless it is
-    done.
-    """
+def show_sizes(sizes: list, removed: bool, advice: str) -> None:
+    """Print folders with their sizes in MB, and the total; `advice` follows unless they go now."""
     for path, size in sizes:
         print(f"{size / 2**20:9.1f} MB  {path}")
     total = sum(size for _, size in sizes) / 2**20
-    print(f"{total:9.1f} MB  in {len(sizes)} folders" + ("" if done else f"; {advice}"))
+    print(f"{total:9.1f} MB  in {len(sizes)} folders" + ("" if removed else f"; {advice}"))
 
 
 @click.command()
@@ -106,19 +102,19 @@ def verify(scenes: tuple[str, ...]) -> int:
 @click.command("clean-stale")
 @click.option("--yes", is_flag=True, help="remove what is listed")
 @click.option(
-    "--keep-newer", type=Age(), default=0.0, help="spare what is younger: 30m, 12h, 7d, 4w"
+    "--keep-newer", type=Age(), default=0.0, help="keep what is younger: 30m, 12h, 7d, 4w"
 )
 @click.option(
     "--older-than",
     type=Age(),
-    help="give up scenes and studies, too, that nothing was added to for so long",
+    help="also remove scenes and studies without additions for so long",
 )
 def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
     """List the artifacts that no scene names any more, and leftovers of killed runs."""
     from chebsplat.pipelines.work import inventory, store
 
-    old = [] if older_than is None else inventory.untouched(older_than)
-    leftovers = store.unnamed(set(old))
+    old = [] if older_than is None else inventory.list_idle(older_than)
+    leftovers = store.list_unreferenced(set(old))
     leftovers = [
         (path, size) for path, size in leftovers if not keep_newer or store.age(path) >= keep_newer
     ]
@@ -132,17 +128,14 @@ def clean_stale(yes: bool, keep_newer: float, older_than: float | None) -> None:
 
 @click.command()
 def status() -> None:
-    """Say what runs, waits and has failed, with seconds and the end of the log, here and on a
-    cluster.
-    """
+    """Show running, waiting and failed steps, with seconds and the end of the log."""
     from chebsplat.pipelines.work import store
     from chebsplat.pipelines.work.summary import lines
 
-    said = False
-    for line in lines():
+    report = list(lines())
+    for line in report:
         print(line)
-        said = True
-    if not said:
+    if not report:
         print(f"nothing runs in {store.work()}, and nothing has failed", file=sys.stderr)
 
 

@@ -1,6 +1,4 @@
-"""Commands on a finished scene, or before one: query, mesh, extract, export, lift,
-label, check-teacher, get-teacher, knowledge, calibrate.
-"""
+"""Commands on a finished scene (query, mesh, extract, export, lift, label) and on teachers."""
 
 from __future__ import annotations
 
@@ -16,8 +14,8 @@ from chebsplat.formats.splats import WRITTEN
 from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath, Phrases, Upward
 
 
-def told(figures: Mapping[str, Any], out: Path) -> None:
-    """Figures go to stderr, and what was made to stdout."""
+def report(figures: Mapping[str, Any], out: Path) -> None:
+    """Print figures to stderr and the path of what was written to stdout."""
     print(", ".join(f"{name} {value:,}" for name, value in figures.items()), file=sys.stderr)
     print(out)
 
@@ -30,15 +28,15 @@ def told(figures: Mapping[str, Any], out: Path) -> None:
     "--top", type=click.IntRange(1), default=8, show_default=True, help="labels in the table"
 )
 def query(scene: str, text: str, against: list[str], top: int) -> None:
-    """Is TEXT, such as "something to sit on", in a finished SCENE, and how likely are its Gaussians
-    that, by label?
-    """
+    """Tell if TEXT, such as "something to sit on", is in a finished SCENE, and where, by label."""
     from chebsplat.pipelines.api import load
     from chebsplat.stages.tools.query import table
 
     opened = load(scene)
     answer = opened.ask(text, against)
-    assert opened.labels is not None and opened.label_names is not None  # of a scene that answers
+    assert (
+        opened.labels is not None and opened.label_names is not None
+    )  # a scene that can be queried has labels
     print(answer, *table(answer, opened.labels, opened.label_names, top), sep="\n")
 
 
@@ -49,11 +47,11 @@ def query(scene: str, text: str, against: list[str], top: int) -> None:
     "photos",
     type=click.Path(path_type=Path),
     multiple=True,
-    help="yours, or a folder: eight tell the usual mistakes; default: a view of a generated room",
+    help="a photo or folder; eight reveal the usual mistakes; default: a view of a generated room",
 )
 @click.option("--labels", help="text file of labels; default: the teacher's own")
 def check_teacher(model: Path, photos: tuple[Path, ...], labels: str | None) -> None:
-    """Run images through a teacher MODEL (.onnx): what it is, costs and sees, what may be wrong."""
+    """Run images through a teacher MODEL (.onnx): settings, cost, labels and likely mistakes."""
     from chebsplat.stages.tools.get_teacher import check
 
     for what, finding in check(model, photos, labels):
@@ -75,9 +73,7 @@ def check_teacher(model: Path, photos: tuple[Path, ...], labels: str | None) -> 
     help="the ONNX file in the repository",
 )
 def get_teacher(name: str, out: Path | None, graph: str) -> None:
-    """Fetch a segmenter from the Hugging Face hub as a teacher: segformer-b0-ade, or
-    hf:OWNER/NAME[@REVISION].
-    """
+    """Fetch a segmenter from the Hugging Face hub: segformer-b0-ade or hf:OWNER/NAME[@REVISION]."""
     from chebsplat.stages.tools.get_teacher import get_teacher as fetch
 
     model, findings = fetch(name, out, graph)
@@ -95,9 +91,7 @@ def get_teacher(name: str, out: Path | None, graph: str) -> None:
 )
 @click.option("--min-opacity", type=click.FloatRange(0, 1), default=0.0, help="activated")
 @click.option("--box", help="x0,y0,z0,x1,y1,z1 that centres lie in, scene units")
-@click.option(
-    "--query", "text", help="words: what is likelier than not these, in parts that hang together"
-)
+@click.option("--query", "text", help="words: the connected Gaussians that are probably these")
 @AGAINST
 def extract(
     scene: str,
@@ -117,7 +111,7 @@ def extract(
         raise ConfigError("--against is of a query; add --query TEXT")
     opened = load(scene)
     query_vectors = None if text is None else opened.understood(text, against)
-    told(write(opened, out, labels, min_opacity, corners(box), query_vectors), out)
+    report(write(opened, out, labels, min_opacity, corners(box), query_vectors), out)
 
 
 @click.command()
@@ -129,15 +123,12 @@ def extract(
     default="spz",
     show_default=True,
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="default: called like the scene, where you stand"
-)
+@click.option("--out", type=click.Path(path_type=Path), help="default: named like the scene, here")
 @UP
 def export(scene: str, kind: str, out: Path | None, up: Any) -> None:
-    """Write a finished SCENE as one file that viewers open; with --up turned, so that it stands
-    there. A .glb does in any case.
+    """Write a finished SCENE as one file for viewers; with --up turned upright, a .glb always.
 
-    Without a SCENE, the stage of this name: --help says more.
+    Without a SCENE, this is the stage of the same name (--help).
     """
     from chebsplat.pipelines.api import load
     from chebsplat.stages.tools.up import up_of
@@ -147,7 +138,7 @@ def export(scene: str, kind: str, out: Path | None, up: Any) -> None:
     if up is not None:
         up = up_of(up, opened.parameters, opened.exported.cameras.cam_from_world)
     opened.export(path, up)
-    told({"Gaussians": len(opened), "bytes": path.stat().st_size}, path)
+    report({"Gaussians": len(opened), "bytes": path.stat().st_size}, path)
 
 
 @click.command()
@@ -177,14 +168,14 @@ def lift(ply: Path, capture: str | None, teacher: Path | None, up: Any, out: Pat
             raise ConfigError(
                 "--teacher looks at photos; add --capture, or label by shape alone: chebsplat label"
             )
-        told(import_ply(ply, out, up), out)
+        report(import_ply(ply, out, up), out)
         return
     if up is not None:
         raise ConfigError("--up is of a splat alone; with --capture its cameras tell")
     source = artifact_of(capture, "ingest")
     beside = {} if is_artifact(Path(capture)) else links(scene_folder(capture))
     features = None if teacher else beside.get("teacher")
-    told(lift_ply(ply, source, beside.get("sfm"), features, teacher, out), out)
+    report(lift_ply(ply, source, beside.get("sfm"), features, teacher, out), out)
 
 
 @click.command()
@@ -192,9 +183,7 @@ def lift(ply: Path, capture: str | None, teacher: Path | None, up: Any, out: Pat
 @click.option("--rooms", type=int, default=12, show_default=True, help="generated rooms")
 @click.option("--force", is_flag=True, help="replace the calibration that is there")
 def calibrate(model: Path | None, rooms: int, force: bool) -> None:
-    """Find out on generated rooms what the relevancy of a teacher MODEL (.onnx) means; kept beside
-    it, for `query`.
-    """
+    """Calibrate the relevancy of a teacher MODEL (.onnx) on generated rooms; stored beside it."""
     from chebsplat.formats.calibration import beside, write_calibration
     from chebsplat.formats.teacher_model import EMBEDDED
     from chebsplat.stages.runtime.progress import Progress
@@ -203,9 +192,9 @@ def calibrate(model: Path | None, rooms: int, force: bool) -> None:
     path = beside(model or EMBEDDED)
     if path.exists() and not force:
         raise ConfigError(f"{path} exists; remove it, or add --force")
-    found = measure(model or EMBEDDED, rooms, Progress())
-    write_calibration(path, found)
-    for name, value in found.made["on_rooms_left_out"].items():
+    calibration = measure(model or EMBEDDED, rooms, Progress())
+    write_calibration(path, calibration)
+    for name, value in calibration.made["on_rooms_left_out"].items():
         print(f"{name.replace('_', ' '):16s}{value:6.1%}", file=sys.stderr)
     print(path)
 
@@ -215,14 +204,14 @@ def calibrate(model: Path | None, rooms: int, force: bool) -> None:
 @click.option(
     "--words",
     type=Phrases(),
-    help="to choose among, with commas; default: the classes of generated rooms",
+    help="label set, with commas; default: the classes of generated rooms",
 )
 @click.option(
     "--up",
     type=Upward(),
-    default="z",
+    default="auto",
     show_default=True,
-    help="against gravity: -y, 0,0,1, auto, ...",
+    help="against gravity: auto (by the room's shape), z, -y, 0,0,1, ...",
 )
 @click.option(
     "--unit",
@@ -248,9 +237,7 @@ def label(
     knowledge: Path | None,
     out: Path,
 ) -> None:
-    """Name the Gaussians of any .PLY of a room by shape alone, with a confidence: no photo, no 2D
-    teacher.
-    """
+    """Name the Gaussians of any .PLY of a room by shape alone: no photo, no 2D teacher needed."""
     from chebsplat.formats.knowledge import SHIPPED
     from chebsplat.stages.tools.lift_ply import label_ply
     from chebsplat.synthetic import CLASS_NAMES
@@ -282,19 +269,21 @@ def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool, 
     """Write the surface of a finished SCENE as triangles with colours and labels, in the scene's
     frame; with --up turned, so that up is z. A .glb is turned in any case, up to y.
     """
-    from chebsplat.formats.meshes import write_mesh
+    from chebsplat.formats.meshes import meshlab, write_mesh
     from chebsplat.pipelines.api import load
     from chebsplat.stages.runtime.progress import Progress
     from chebsplat.stages.tools.mesh import mesh_of, turned
     from chebsplat.stages.tools.up import up_of
 
+    if not raw:
+        meshlab()  # missed before a scene is opened
     opened = load(scene)
-    made, facts = mesh_of(opened, voxel, triangles, raw, Progress())
+    surface, facts = mesh_of(opened, voxel, triangles, raw, Progress())
     if up is not None or out.suffix.lower() == ".glb":
         up, poses = "auto" if up is None else up, opened.exported.cameras.cam_from_world
-        made = turned(made, up_of(up, opened.parameters, poses), out.suffix)
-    write_mesh(out, made, opened.label_names)
-    told(facts, out)
+        surface = turned(surface, up_of(up, opened.parameters, poses), out.suffix)
+    write_mesh(out, surface, opened.label_names)
+    report(facts, out)
 
 
 COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, export, lift, label, mesh)

@@ -1,1 +1,1 @@
-"""Which steps a scene needs, and under which keys."""
+"""The steps that a scene needs, and their keys."""

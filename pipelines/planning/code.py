@@ -1,10 +1,9 @@
-"""Identity of a step: one digest of all that its result depends on, its code among it, and of
-nothing else.
+"""Identity of a step: one digest of all that its result depends on, its code included.
 
 The hash of the code behind a stage covers the syntax trees, without comments and docstrings, of the
 stage's module and of every module of ours it imports, however deep, the templates of pages beside
-them, and the versions of the packages these import. Plumbing that cannot change a result is left
-out, so that a better progress bar makes nothing stale.
+them, and the versions of the packages these import. Runtime code that cannot change a result is
+left out, so that a better progress bar makes nothing stale.
 """
 
 from __future__ import annotations
@@ -26,11 +25,10 @@ PLUMBING = tuple(
     f"chebsplat.{name}."
     for name in ("settings", "stages.settings", "stages.registry", "stages.runtime")
 )
-TEMPLATES = {".html", ".css", ".js"}  # of a package: what its modules fill
-# of extras: count where a scene uses them
+TEMPLATES = {".html", ".css", ".js"}  # templates that a package's modules fill
+# of extras: part of the key where a scene uses them
 OPTIONAL = {"av", "gsplat", "pillow_heif", "tokenizers", "transformers"}
-# Settings that say where raw files lie. Their content is hashed instead: where it lies is no
-# matter.
+# Settings that are paths of raw files: their content is hashed in place of the path.
 PLACES = (
     ("source", "path"),
     ("ingest", "volumes"),
@@ -46,9 +44,9 @@ PLACES = (
 
 
 class Code:
-    """Reads the modules of ours below `package`, the folder of `chebsplat`. `memo` maps a path to
-    what was found in it at a (mtime, size); the caller keeps it, so that an unchanged file is not
-    parsed again.
+    """Hashes the modules of ours below `package`, the folder of `chebsplat`. `memo` maps a path to
+    the digest and imports of its file at a (mtime, size); the caller saves it, so that an unchanged
+    file is not parsed again.
     """
 
     def __init__(self, package: Path, memo: dict[str, list]):
@@ -58,8 +56,7 @@ class Code:
         self._stages: dict[str, dict[str, Any]] = {}
 
     def stage(self, name: str, used: tuple[str, ...] = ()) -> dict[str, Any]:
-        """{"hash": ..., "packages": {name: version}} of stage `name`; read once in this object's
-        life.
+        """{"hash": ..., "packages": {name: version}} of stage `name`; computed once by this object.
 
         Args: used: packages of extras that the configuration uses; others of OPTIONAL are no part
           of the identity.
@@ -70,28 +67,28 @@ class Code:
         return identity | {"packages": identity["packages"] | self._versions_of(used)}
 
     def _identity(self, name: str) -> dict[str, Any]:
-        seen: dict[str, str] = {}
+        digests: dict[str, str] = {}
         packages: set[str] = set()
-        waiting = [f"chebsplat.stages.{name}"]
-        while waiting:
-            module = waiting.pop()
+        queue = [f"chebsplat.stages.{name}"]
+        while queue:
+            module = queue.pop()
             path = self._path(module)
-            if module in seen or f"{module}.".startswith(PLUMBING) or path is None:
+            if module in digests or f"{module}.".startswith(PLUMBING) or path is None:
                 continue
             digest, imports = self._read(path)
-            seen[module] = digest
+            digests[module] = digest
             if path.name == "__init__.py":
                 templates = (
                     file for file in sorted(path.parent.iterdir()) if file.suffix in TEMPLATES
                 )
-                seen |= {f"{module}/{file.name}": self._read(file)[0] for file in templates}
+                digests |= {f"{module}/{file.name}": self._read(file)[0] for file in templates}
             for imported in imports:
                 first = imported.partition(".")[0]
                 if first == "chebsplat":
-                    waiting += self._modules(imported)
+                    queue += self._modules(imported)
                 elif first not in sys.stdlib_module_names:
                     packages.add(first)
-        text = "\n".join(f"{module} {digest}" for module, digest in sorted(seen.items()))
+        text = "\n".join(f"{module} {digest}" for module, digest in sorted(digests.items()))
         versions = self._versions_of(packages - OPTIONAL)
         return {"hash": hashlib.sha256(text.encode()).hexdigest()[:16], "packages": versions}
 
@@ -130,21 +127,20 @@ class Code:
         return self._versions[package]
 
 
-def _remembers(held: Any, stamp: list[int]) -> bool:
-    """Whether an entry of the memo, which is a file that anything may have happened to, is of this
-    stamp.
-    """
+def _remembers(entry: Any, stamp: list[int]) -> bool:
+    """True for a well-formed entry of the memo, a file that may be damaged, with this stamp."""
     if not (
-        isinstance(held, list) and len(held) == 3 and held[0] == stamp and isinstance(held[1], str)
+        isinstance(entry, list)
+        and len(entry) == 3
+        and entry[0] == stamp
+        and isinstance(entry[1], str)
     ):
         return False
-    return isinstance(held[2], list) and all(isinstance(name, str) for name in held[2])
+    return isinstance(entry[2], list) and all(isinstance(name, str) for name in entry[2])
 
 
 def parsed(text: str, name: str) -> tuple[str, list[str]]:
-    """Digest of a module's syntax tree without docstrings, and the dotted names it imports; of a
-    template's text.
-    """
+    """Digest of a module's syntax tree without docstrings, and its imports; or of a template."""
     if not name.endswith(".py"):
         return hashlib.sha256(text.encode()).hexdigest()[:16], []
     tree = ast.parse(text, name)
@@ -175,15 +171,14 @@ def step_key(
 ) -> str:
     """Key of a stage's artifact, 16 hex digits.
 
-    Args: sections: the config that the stage reads; inputs: keys of artifacts by role;
-          code: of `Code.stage`; raw: `raw.content_hash` of the files outside the store that the
-            stage reads;
-          device: that computes it. The CPU's keys do not name it.
+    Args: sections: the config that the stage reads; inputs: keys of artifacts by role; code: of
+      `Code.stage`; raw: `raw.content_hash` of the files outside the store that the stage reads;
+      device: that computes it. The CPU's keys do not name it.
     """
     identity = {
         "stage": stage.name,
         "schema": stage.schema,
-        "config": placeless(sections),
+        "config": without_paths(sections),
         "inputs": inputs,
         "code": code,
     } | ({} if raw is None else {"raw": raw})
@@ -193,10 +188,10 @@ def step_key(
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def placeless(sections: dict[str, Any]) -> dict[str, Any]:
+def without_paths(sections: dict[str, Any]) -> dict[str, Any]:
     """Sections that name raw files by their last part only."""
-    kept = {name: dict(section) for name, section in sections.items()}
+    named = {name: dict(section) for name, section in sections.items()}
     for section, key in PLACES:
-        if kept.get(section, {}).get(key):
-            kept[section][key] = Path(kept[section][key]).name
-    return kept
+        if named.get(section, {}).get(key):
+            named[section][key] = Path(named[section][key]).name
+    return named

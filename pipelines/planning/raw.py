@@ -1,6 +1,4 @@
-"""Raw files, which stages read outside the store: what a key holds of them, and whether they stayed
-what they were.
-"""
+"""Raw files, which stages read outside the store: their hashes, and a check for changes."""
 
 from __future__ import annotations
 
@@ -21,14 +19,13 @@ from chebsplat.formats.images import images_below
 from chebsplat.formats.splats import splat_file
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 
-# ns; no file system's clock is coarser. What changed later than this may yet change unseen
+# ns, coarser than any file system's clock: a younger file may change without a new time stamp
 SETTLED = 2_000_000_000
-Hashes = dict[str, list[Any]]  # path -> [stamp, sha256, whether it was settled when it was read]
+Hashes = dict[str, list[Any]]  # path -> [stamp, sha256, older than SETTLED when it was read]
 
 
 def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[Path]]:
-    """The files that a stage reads with these settings, and the folder they belong to (None: only
-    names count).
+    """The files that a stage reads with these settings, and their folder (None: names alone count).
 
     Raises: InputError if there are none where there must be.
     """
@@ -46,7 +43,7 @@ def raw_files(stage: str, sections: dict[str, Any]) -> tuple[Path | None, list[P
     if stage == "learn" and sections["learn"]["points"]:
         return None, [_named(sections["learn"]["points"], "learn.points")]
     if stage == "teach":
-        return None, _of_model(sections["teach"]["model"])
+        return None, read_teacher(Path(sections["teach"]["model"] or EMBEDDED)).files()
     if stage == "evaluate" and sections["evaluate"]["lpips_weights"]:
         return None, [_named(sections["evaluate"]["lpips_weights"], "evaluate.lpips_weights")]
     return None, []
@@ -64,11 +61,6 @@ def _of_source(source: dict[str, Any]) -> tuple[Path | None, list[Path]]:
     return folder, import_module(f"chebsplat.stages.sources.{kind}").files(folder)
 
 
-def _of_model(model: str | None) -> list[Path]:
-    """The files of a teacher, the embedded one if none is named."""
-    return read_teacher(Path(model) if model else EMBEDDED).files()
-
-
 def _of_teacher(settings: dict[str, Any]) -> list[Path]:
     """The model's files, and the file of labels."""
     labels = [_named(settings["labels"], "teacher.labels")] if settings["labels"] else []
@@ -76,9 +68,7 @@ def _of_teacher(settings: dict[str, Any]) -> list[Path]:
 
 
 def _of_channels(settings: dict[str, Any]) -> list[Path]:
-    """The model's files, its channel map's where it brings one, and the reference images; none of a
-    scene's.
-    """
+    """The model's files, its channel map's if any, and the reference images; none of a scene's."""
     folder = settings["reference"]
     images = images_below(Path(folder), "correct channels.reference") if folder else []
     teacher = read_teacher(Path(settings["model"]))
@@ -130,9 +120,9 @@ def content_hash(entries: Hashes, root: Path | None) -> str:
 
 @contextmanager
 def unchanged(stage: str, sections: dict[str, Any], planned: Hashes) -> Iterator[None]:
-    """A stage reads its raw files within, before and after which they are what the key says.
+    """Check before and after the block that a stage's raw files are those that its key hashes.
 
-    Raises: InputError naming the file that is another now, is new or gone.
+    Raises: InputError naming a file that has changed, is new or gone.
     """
     memo = {path: entry for path, entry in planned.items() if entry[2]}
 

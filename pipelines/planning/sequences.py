@@ -1,5 +1,5 @@
-"""Plans of more than a scene: scenes in order, each with what those before it have taught; and
-plans of no scene: what teaches knowledge, and what learns lessons again.
+"""Plans of several scenes in order, each with the lessons of those before it; and plans without a
+scene: training an encoder of shape, and learning lessons again.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from chebsplat.formats.knowledge import SCHEMA, SHIPPED
 from chebsplat.formats.names import unprintable
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines.planning.plan import (
-    Learned,
     Overrides,
     Plan,
+    PlannedLesson,
     Planner,
     merged,
     overrides,
-    placed,
+    resolve_paths,
 )
 from chebsplat.pipelines.work import heads, store
 from chebsplat.pipelines.work.scenes import read_named
@@ -46,27 +46,29 @@ def scenes_of(name: str) -> list[str]:
     return scenes
 
 
-def chain(planner: Planner, name: str, settings: Overrides = "", ablation: str = "") -> list[Plan]:
-    """Plans of a sequence's scenes, each with what those before it have taught: their lessons, or
-    in the printed form the bases that the training before has left.
+def plan_sequence(
+    planner: Planner, name: str, settings: Overrides = "", ablation: str = ""
+) -> list[Plan]:
+    """Plans of a sequence's scenes, each with the lessons of those before it, or in the printed
+    method with the bases of the training before it.
     """
-    found: list[Plan] = []
+    plans: list[Plan] = []
     for number, scene in enumerate(scenes_of(name), start=1):
-        earlier = found[-1].targets["train"] if found and ablation == "paper" else None
+        earlier = plans[-1].targets["train"] if plans and ablation == "paper" else None
         lessons, place = (
-            [plan.lesson for plan in found if plan.lesson is not None],
+            [plan.lesson for plan in plans if plan.lesson is not None],
             f"{Path(name).stem}-{number}-",
         )
-        found.append(
+        plans.append(
             planner.plan(scene, settings, ablation, earlier=earlier, place=place, lessons=lessons)
         )
-    return found
+    return plans
 
 
-def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
-    """The steps that teach knowledge for a teacher, the embedded one if none is named.
+def plan_teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
+    """The steps that train an encoder of shape for a teacher, by default the embedded one.
 
-    Raises: ConfigError on a closed-set teacher, whose classes no shape is taught.
+    Raises: ConfigError on a closed-set teacher, which has no features to learn.
     """
     file = (model or EMBEDDED).expanduser().resolve()
     teacher = read_teacher(file)
@@ -78,7 +80,9 @@ def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
         "channels": {"model": str(file)},
         "teach": {"model": str(file)} if model else {},
     }
-    config = placed(configs.build(merged(of, overrides(settings)), f"knowledge for {teacher.name}"))
+    config = resolve_paths(
+        configs.build(merged(of, overrides(settings)), f"knowledge for {teacher.name}")
+    )
     channels = planner.step(STAGES["channels"], config, {}, {})
     inputs = {"channels": channels.path}
     teach = planner.step(STAGES["teach"], config, inputs, {"channels": channels.key})
@@ -87,35 +91,38 @@ def teaching(planner: Planner, model: Path | None, settings: str = "") -> Plan:
     )
 
 
-def relearning(planner: Planner, name: str) -> list[Plan]:
-    """The steps that learn the lessons of a set again by the encoder that ships now, from what the
-    store holds. Lessons by that encoder, and of scenes whose artifacts are gone, stay as they are.
+def plan_relearning(planner: Planner, name: str) -> list[Plan]:
+    """The steps that learn the lessons of a set again by the encoder that ships now, from stored
+    artifacts. Lessons by that encoder, and of scenes whose artifacts are gone, stay as they are.
     """
-    found: list[Plan] = []
-    start = store.taken_in(SHIPPED, "teach", SCHEMA, planner.running)
+    plans: list[Plan] = []
+    start = store.import_artifact(SHIPPED, "teach", SCHEMA, planner.running)
     for key, record in heads.members(name).items():
         manifest = artifact.read_manifest(heads.folder(name) / key)
-        made = {role: store.artifact_path(STAGES["learn"].roles[role], entry["key"])
-                for role, entry in manifest.inputs.items() if role not in ("start", "encoding")}  # fmt: skip
+        inputs = {
+            role: store.artifact_path(STAGES["learn"].roles[role], entry["key"])
+            for role, entry in manifest.inputs.items()
+            if role not in ("start", "encoding")
+        }
         if record["start"] == start.name:
             continue
-        if not all(map(store.is_fresh, made.values())):
+        if not all(map(store.is_fresh, inputs.values())):
             store.say(
                 f"{record['scene']}: its artifacts are gone; run the scene again, and it is "
                 "learned anew"
             )
             continue
         config = configs.build(manifest.config, f"lesson {key}")
-        of = {"descriptors": made["descriptors"], "start": start}
+        roles = {"descriptors": inputs["descriptors"], "start": start}
         encode = planner.step(
-            STAGES["encode"], config, of, {role: path.name for role, path in of.items()}
+            STAGES["encode"], config, roles, {role: path.name for role, path in roles.items()}
         )
-        of = made | {"encoding": encode.path, "start": start}
+        roles = inputs | {"encoding": encode.path, "start": start}
         learn = planner.step(
-            STAGES["learn"], config, of, {role: path.name for role, path in of.items()}
+            STAGES["learn"], config, roles, {role: path.name for role, path in roles.items()}
         )
-        lesson = Learned(name, learn.path, record["capture"], start.name, record["scene"])
-        found.append(
+        lesson = PlannedLesson(name, learn.path, record["capture"], start.name, record["scene"])
+        plans.append(
             Plan(f"learned-{key}", f"the lesson of {record['scene']}", [encode, learn], {}, lesson)
         )
-    return found
+    return plans

@@ -1,1 +1,1 @@
-"""A plan run to its end, here or on a cluster."""
+"""Plans executed by Snakemake, on this machine or on a cluster."""

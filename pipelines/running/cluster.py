@@ -1,5 +1,4 @@
-"""A run on a cluster: what its jobs ask for, which steps go there together, and that they end with
-the run.
+"""Runs on a cluster: resources of jobs, steps grouped into jobs, and jobs ended with their run.
 
 Snakemake submits a job, and on its node starts one step after the other, each in a process of its
 own as on one machine. The pipe that ends jobs with their run (processes.py) does not reach another
@@ -21,6 +20,7 @@ from typing import Any
 import yaml
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.extras import require
 from chebsplat.pipelines.work import leases, store
 from chebsplat.pipelines.work.store import say
 from chebsplat.settings import MOST_STEPS
@@ -29,20 +29,20 @@ from chebsplat.stages.runtime.stopping import end_itself
 
 HERE = Path(__file__).parents[1]
 LOCAL, SLURM = "local", "slurm"
-EXTRA = ".venv/bin/python -m uv pip install --python .venv/bin/python --editable '.[slurm]'"
+PLUGIN = "snakemake_executor_plugin_slurm"
 
 
 @dataclass(frozen=True)
 class Need:
-    """What a stage asks a cluster for."""
+    """Resources that a stage requests of a cluster."""
 
     minutes: int
-    mem_mb: int  # doubled at each further attempt
+    mem_mb: int  # doubled at each retry
 
 
-# Ample: ten times the seconds that were measured at most, three times the memory, since a job that
-# asks for too little is lost, and one that asks for too much begins a little later.
-# measured in 18 scenes on two EPYC cores: seconds (median, most); most memory, in office0
+# Ten times the longest measured time and three times the memory: a job that requests too little is
+# lost, one that requests too much starts a little later.
+# Measured in 18 scenes on two EPYC cores: seconds (median, max); peak memory in office0.
 NEEDS = {
     "pose": Need(100, 4000),
     "ingest": Need(10, 2000),  # 21, 49; 306 MB
@@ -56,14 +56,14 @@ NEEDS = {
     "learn": Need(5, 4000),
     "recall": Need(5, 4000),
     "onnx": Need(5, 4000),
-    "train": Need(15, 4000),  # and by its steps: 80, 239 for 3000; 693 MB
+    "train": Need(15, 4000),  # plus the time of its steps: 80, 239 for 3000; 693 MB
     "lift": Need(5, 2000),  # 5, 12; 571 MB
     "refine": Need(5, 4000),  # 9, 22; 1083 MB
     "export": Need(5, 2000),  # 1, 2; 138 MB
     "evaluate": Need(5, 2000),  # 5, 27; 646 MB
     "report": Need(5, 2000),  # 2, 7; 144 MB
 }
-BESIDE = {  # the inputs beside which a step runs, as part of its job: the first that is made
+BESIDE = {  # a step joins the job that makes the first of these inputs
     "describe": ("points", "capture"),
     "encode": ("descriptors",),
     "learn": ("features", "encoding"),
@@ -71,12 +71,12 @@ BESIDE = {  # the inputs beside which a step runs, as part of its job: the first
     "agree": ("features",),
     "evaluate": ("scene",),
 }
-STEP_SECONDS = 0.08  # of a training, at most
-SHORT = 60.0  # seconds of a training that is no job of its own
+STEP_SECONDS = 0.08  # upper bound of a training step
+SHORT = 60.0  # seconds up to which a training is not a job of its own
 
 
 def profile(on: str) -> Path:
-    """The folder of Snakemake's settings for where a run goes: one of ours, or the user's.
+    """The folder of Snakemake's settings for a run's destination: one of ours, or the user's.
 
     Raises: ConfigError where there is none.
     """
@@ -93,13 +93,17 @@ def profile(on: str) -> Path:
 
 
 def checked(on: str) -> str:
-    """`on`, if it can be had here: ConfigError says what is missing, and what adds it."""
+    """`on`, if it is usable here. Raises ConfigError naming what is missing and its remedy."""
     if on == LOCAL:
         return on
     executor = executor_of(on)
-    if find_spec(f"snakemake_executor_plugin_{executor.replace('-', '_')}") is None:
-        advice = EXTRA if executor == SLURM else f"install snakemake-executor-plugin-{executor}"
-        raise ConfigError(f"on={on}: Snakemake's plugin for {executor} is not installed; {advice}")
+    if executor == SLURM:
+        require(PLUGIN, f"on={on}")
+    elif find_spec(f"snakemake_executor_plugin_{executor.replace('-', '_')}") is None:
+        raise ConfigError(
+            f"on={on}: Snakemake's plugin for {executor} is not installed; "
+            f"install snakemake-executor-plugin-{executor}"
+        )
     if executor == SLURM and shutil.which("sbatch") is None:
         raise ConfigError(
             f"on={on}: there is no sbatch on the PATH; run this where jobs are submitted from"
@@ -121,29 +125,27 @@ def executor_of(on: str) -> str:
 
 
 def arguments(plan: Path, on: str, cores: int, threads: int | None) -> list[str]:
-    """What Snakemake is told of a run beside its profile. Jobs at once: cores // threads, where
-    jobs have threads.
-    """
-    chosen = ["--jobs", str(max(cores // threads, 1))] if threads else []
+    """Snakemake's options beside its profile; cores // threads jobs at once, if threads are set."""
+    options = ["--jobs", str(max(cores // threads, 1))] if threads else []
     if executor_of(on) == SLURM:
-        chosen += [
+        options += [
             "--slurm-jobname-prefix",
-            submitted(plan),
+            job_prefix(plan),
             "--slurm-logdir",
             str(plan.parent / "slurm"),
         ]
-    return chosen
+    return options
 
 
 def jobs_of(entries: list[dict[str, Any]], on: str) -> dict[str, dict[str, Any]]:
     """The jobs of a plan, by name: the keys of their steps in order, and what they ask for.
 
-    Choices: on one machine a step is a job. On a cluster steps of seconds go with the one that they
-      follow.
+    Choices: on one machine a step is a job. On a cluster a step of seconds joins the job of the
+      step that it follows.
     """
     jobs: dict[str, list[dict[str, Any]]] = {}
     for name, entry in zip(
-        together(entries) if on != LOCAL else map(name_of, entries), entries, strict=True
+        job_names(entries) if on != LOCAL else map(name_of, entries), entries, strict=True
     ):
         jobs.setdefault(name, []).append(entry)
     return {
@@ -164,13 +166,12 @@ def name_of(entry: dict[str, Any]) -> str:
     return f"{entry['stage']}-{entry['key']}"
 
 
-def together(entries: list[dict[str, Any]]) -> list[str]:
-    """For each step, in their order, the name of the job that it belongs to: that of the job's
-    first step.
+def job_names(entries: list[dict[str, Any]]) -> list[str]:
+    """For each step, in order, the name of its job, which is that of the job's first step.
 
-    Choices: four kinds of jobs, and none waits for one that waits for it: what a capture begins, a
-      teacher that runs a model, a training, and what follows that. A short training goes with what
-      follows it. Other steps go alone.
+    Choices: four kinds of jobs, without cycles: capture and points, a teacher that runs a model, a
+      training, and the steps after it. A short training joins the steps after it. Other steps are
+      jobs of their own.
     """
     by_path = {entry["path"]: entry for entry in entries}
 
@@ -200,51 +201,49 @@ def together(entries: list[dict[str, Any]]) -> list[str]:
 
 
 def seconds_of(train: dict[str, Any]) -> float:
-    """How long a training takes, about."""
+    """Estimated seconds of a training."""
     settings = train["config"]["train"]
     return float(settings["seconds"] or (settings["steps"] or MOST_STEPS) * STEP_SECONDS)
 
 
 def minutes_of(entry: dict[str, Any]) -> int:
-    """The time that a step asks for."""
+    """Minutes that a step requests."""
     more = 10 * seconds_of(entry) / 60 if entry["stage"] == "train" else 0
     return NEEDS[entry["stage"]].minutes + round(more)
 
 
-def submitted(plan: Path) -> str:
-    """What the names of a run's jobs begin with in the cluster's queue."""
+def job_prefix(plan: Path) -> str:
+    """Prefix of the names of a run's jobs in the cluster's queue."""
     return f"chebsplat-{plan.parent.name}"
 
 
-def withdraw(plan: Path, on: str) -> None:
-    """Take a run's jobs out of Slurm's queue; those that run are sent SIGTERM. Others see that the
-    run has ended.
-    """
+def cancel_jobs(plan: Path, on: str) -> None:
+    """Cancel a run's jobs in Slurm's queue; others watch the run's lease (`watch_run`)."""
     if executor_of(on) != SLURM:
         return
     listed = subprocess.run(
         ["squeue", "--me", "--noheader", "--format=%i %j"], capture_output=True, text=True
     )
-    ours = [line.split()[0] for line in listed.stdout.splitlines() if f" {submitted(plan)}" in line]
+    ours = [
+        line.split()[0] for line in listed.stdout.splitlines() if f" {job_prefix(plan)}" in line
+    ]
     if listed.returncode or (
         ours and subprocess.run(["scancel", *ours], capture_output=True).returncode
     ):
         say(
-            f"jobs could not be taken out of the queue; those called {submitted(plan)}... end by "
+            f"jobs could not be taken out of the queue; those called {job_prefix(plan)}... end by "
             "themselves"
         )
 
 
 def watch_run(plan: Path) -> None:
-    """Stop this process, a job on a node, when the run of its plan ends: it lets go of its lease,
-    or falls silent.
-    """
+    """Stop this process, a job on a node, when its run releases its lease or lets it expire."""
 
     def watch() -> None:
         goes_on = True
         while goes_on:
             time.sleep(leases.EVERY)
-            with suppress(OSError):  # a file system that does not answer for a while is asked again
+            with suppress(OSError):  # a file system may be unavailable for a while
                 goes_on = store.holder(store.run_lease(plan.parent)) is not None
         end_itself()
 

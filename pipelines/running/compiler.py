@@ -1,15 +1,13 @@
-"""What a process that compiles kernels begins with: one forked from it begins 2.5 processor seconds
-further on.
-"""
+"""Imports of the process that compiles kernels: a fork of it saves 2.5 processor seconds."""
 
 from __future__ import annotations
 
 import numba
-import torch  # noqa: F401 - nearly all that is rehearsed imports it
+import torch  # noqa: F401 - nearly every compiled part imports it
 
 
 def first(x: int) -> int:
-    """The first function that a process compiles waits for what numba knows of all types."""
+    """A trivial kernel: compiling it makes numba initialise its type tables."""
     return x
 
 

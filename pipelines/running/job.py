@@ -13,29 +13,28 @@ from typing import Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.pipelines.planning.raw import unchanged
-from chebsplat.pipelines.running.precompile import rehearsed
+from chebsplat.pipelines.running.precompile import precompile
 from chebsplat.pipelines.work import leases, store
 from chebsplat.pipelines.work.store import say
 from chebsplat.stages.runtime.command import Planned, n_threads, publish
 from chebsplat.stages.runtime.stopping import exit_code
 
 FINAL = {error.exit_code for error in (ConfigError, InputError, DataFailure)}
-CODE = "{:<4d}"  # of a job, written over in place: a full disk does not keep it from being told
+CODE = "{:<4d}"  # exit code, overwritten in place, which works on a full disk too
 
 
 def run(plan: Path, key: str, again: bool = False) -> int:
-    """One Snakemake job; returns the exit code of its step, which is written beside the plan, and
-    so is its log.
+    """Run one step as a Snakemake job; its exit code and log are written beside the plan.
 
-    Args: again: it may be another attempt, with more memory. What settings or data do not allow is
-      not tried again.
+    Args: again: this may be a retry with more memory; errors of settings or data are not retried.
+    Returns: the exit code.
     """
     _, files = read_step(plan, key)
     exit_file = Path(f"{files}.exit")
     if again and (earlier := int(exit_file.read_text())) in FINAL:
         return earlier
-    os.utime(exit_file)  # `status` says how long ago
-    with logged(Path(f"{files}.log")):
+    os.utime(exit_file)  # the start time that `status` shows
+    with log_to_file(Path(f"{files}.log")):
         code = exit_code(lambda: make(plan, key), plan.parent)
     with exit_file.open("r+") as handle:
         handle.write(CODE.format(code))
@@ -43,24 +42,23 @@ def run(plan: Path, key: str, again: bool = False) -> int:
 
 
 def use_threads() -> None:
-    """To be called before torch and Numba are imported. Snakemake sets OMP_NUM_THREADS to the one
-    thread that a rule declares; a stage may use all cores of the run.
+    """Set thread counts; to be called before torch and Numba are imported. Snakemake sets
+    OMP_NUM_THREADS to the one thread that a rule declares; a stage may use all cores of the run.
     """
     if threads := os.environ.get("CHEBSPLAT_THREADS"):
         os.environ |= {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
 
 
 def read_step(plan: Path, key: str) -> tuple[dict[str, Any], Path]:
-    """A step of a plan, and the path that the names of its files beside the plan begin with."""
+    """A step of a plan, and the path prefix of its files beside the plan."""
     step = next(s for s in json.loads(plan.read_text())["steps"] if s["key"] == key)
     return step, plan.parent / f"{step['stage']}-{key}"
 
 
 def make(plan: Path, key: str) -> None:
-    """Run a step's stage in this process, under its artifact's lease; a twin in another run is
-    waited for. Nothing is
-    done where the artifact is there already: a job whose node was lost begins with its first step
-      again.
+    """Run a step's stage in this process under its artifact's lease, after another run that holds
+    it. Nothing is done where the artifact exists: a job whose node was lost restarts with its first
+    step.
 
     Raises: ChebsplatError, Stopped.
     """
@@ -74,29 +72,27 @@ def make(plan: Path, key: str) -> None:
     def wait(machine: str) -> None:
         say(f"{stage}: another run is making it on {machine}; waiting")
 
-    with leases.held(lease, wait):
+    with leases.hold(lease, wait):
         store.remove_half(out)
         config, hashes = Path(f"{files}.json"), json.loads(Path(f"{files}.raw.json").read_text())
         module = import_module(f"chebsplat.stages.{stage}")
-        planned = Planned(key, step["code"], prepared(step, hashes))
+        planned = Planned(key, step["code"], prepare_stage(step, hashes), step["expected"])
         publish(stage, module.run, out, inputs, config, planned=planned, device=step["device"])
 
 
 @contextmanager
-def prepared(step: dict[str, Any], hashes: dict[str, Any]) -> Iterator[None]:
-    """What a stage reads stays as it was planned, and the first training on a processor has its
-    kernels.
-    """
-    with ExitStack() as entered:
-        entered.enter_context(unchanged(step["stage"], step["config"], hashes))
+def prepare_stage(step: dict[str, Any], hashes: dict[str, Any]) -> Iterator[None]:
+    """Check raw files before and after a stage, and compile a CPU training's kernels before it."""
+    with ExitStack() as stack:
+        stack.enter_context(unchanged(step["stage"], step["config"], hashes))
         if step["stage"] == "train" and step["device"] != "cuda":
-            entered.enter_context(rehearsed(n_threads(), "features" in step["inputs"]))
+            stack.enter_context(precompile(n_threads(), "features" in step["inputs"]))
         yield
 
 
 @contextmanager
-def logged(path: Path) -> Iterator[None]:
-    """What is logged within goes to a file as well; a full disk costs the log, not the stage."""
+def log_to_file(path: Path) -> Iterator[None]:
+    """Log to a file as well within the block; a full disk costs the log, not the stage."""
     try:
         log: logging.Handler = _Log(path)
     except OSError:

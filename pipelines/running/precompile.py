@@ -1,10 +1,9 @@
-"""Compiling what a training needs, side by side: the first one on a machine waits half as long for
-its first step.
+"""Compiles a training's kernels in parallel: the first training on a machine starts twice as fast.
 
-Numba compiles a kernel when it first meets a kind of arguments, one after the other on one core.
-Here each part of a training meets tiny ones, in a process of its own; what it compiles is kept, and
-found by the training. A run begins
-with it: what comes before a training leaves processors idle.
+Numba compiles a kernel at its first call with new argument types, one after the other on one core.
+Here each part of a training is called with tiny arguments in a process of its own, and finds its
+kernels in the cache afterwards. A run begins with it, as the stages before a training leave
+processors idle.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ N, WIDTH, HEIGHT, CHANNELS = 8, 32, 32, 32
 
 
 def rasterizer() -> None:
-    """A picture of few Gaussians."""
+    """An image of a few Gaussians."""
     import torch
 
     from chebsplat.rasterize import rasterize
@@ -53,28 +52,28 @@ def rasterizer() -> None:
 
 
 def adjoints() -> None:
-    """The rasterizer's gradients, of a picture of one tile that shows nothing."""
+    """The rasterizer's gradients, of an image of one empty tile."""
     from chebsplat.rasterize import ellipses, tiles_adjoint
     from chebsplat.rasterize.binning import TILE
 
-    def none(*shape: int, kind: type = np.float32) -> np.ndarray:
+    def empty(*shape: int, kind: type = np.float32) -> np.ndarray:
         return np.zeros(shape, kind)
 
     bins = (
-        none(0, kind=np.int32),
-        none(2, kind=np.int64),
-        *(none(0, kind=np.int32),) * 2,
-        none(1, 1, kind=np.int32),
+        empty(0, kind=np.int32),
+        empty(2, kind=np.int64),
+        *(empty(0, kind=np.int32),) * 2,
+        empty(1, 1, kind=np.int32),
     )
-    seen = none(0, kind=np.uint16), none(1, kind=np.int64), np.float32(0.99)
-    slopes = none(TILE, TILE, 3), none(TILE // 4, TILE // 4, 4), none(TILE, TILE)
-    tiles_adjoint.backward(0, none(1, 2 * TILE), *bins, *seen, *slopes, False)
+    visible = empty(0, kind=np.uint16), empty(1, kind=np.int64), np.float32(0.99)
+    slopes = empty(TILE, TILE, 3), empty(TILE // 4, TILE // 4, 4), empty(TILE, TILE)
+    tiles_adjoint.backward(0, empty(1, 2 * TILE), *bins, *visible, *slopes, False)
     gaussians, camera = (
-        (none(0, 3), none(0, 4), none(0, 3)),
+        (empty(0, 3), empty(0, 4), empty(0, 3)),
         (np.eye(4), np.eye(3), TILE, TILE, 0.3),
     )
     ellipses.project_adjoint(
-        *gaussians, *camera, none(0, kind=np.int32), none(0, 2), none(0, 3), none(0)
+        *gaussians, *camera, empty(0, kind=np.int32), empty(0, 2), empty(0, 3), empty(0)
     )
 
 
@@ -104,7 +103,7 @@ def losses() -> None:
 
 
 def lifting() -> None:
-    """A lift of features, which a training starts from and is followed by."""
+    """A lift of features, before and after a training."""
     from chebsplat.lifting.observations import estimate, gathered
     from chebsplat.rasterize.lift import lift
 
@@ -118,7 +117,7 @@ def lifting() -> None:
         np.array([[30.0, 0, 16], [0, 30, 16], [0, 0, 1]]),
     )
     cells = np.ones((HEIGHT // 4, WIDTH // 4, CHANNELS), np.float32)
-    said = lift(
+    observations = lift(
         (means, quats, 0.1 * flat, 0.5 * flat[:, 0]),
         np.eye(4),
         K,
@@ -126,7 +125,7 @@ def lifting() -> None:
         cells,
         cells[..., 0],
     )
-    estimate(gathered(4 * N, CHANNELS, [said]), 1)
+    estimate(gathered(4 * N, CHANNELS, [observations]), 1)
 
 
 def descriptors() -> None:
@@ -140,26 +139,25 @@ def descriptors() -> None:
     point_inputs(means, np.tile([0.0, 0, 1], (4 * N, 1)), shapes, up=np.array([0, 0, 1.0]))
 
 
-NEEDED = (colors, losses, adjoints, rasterizer)  # of any training
-SEMANTIC = (lifting, descriptors)  # of one that is taught features
-# a lift has the kernels of a picture in it
+NEEDED = (colors, losses, adjoints, rasterizer)  # by any training
+SEMANTIC = (lifting, descriptors)  # by one with features
+# a lift contains the kernels of an image
 SIDE_BY_SIDE = (rasterizer, lifting), (adjoints,), (losses, colors)
 
 
 @contextmanager
-def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
-    """Within, what a training needs has been compiled; what follows a semantic one has been when
-    the block ends.
+def precompile(n_threads: int, semantic: bool) -> Iterator[None]:
+    """Compile a training's kernels before the block, and those of later stages during it.
 
-    Choices: nothing is done where all is kept already or nothing can be, and with one thread. Where
-      another process is at it, this one takes what is left to take, and waits for the rest.
+    Choices: nothing is done where all are cached or no cache can be written, or with one thread.
+      Where another process compiles, this one compiles the remaining parts, and waits for it.
     """
     from chebsplat.kernels.jit import FOLDER
 
     if (
         FOLDER is None
         or n_threads < 2
-        or all(is_kept(part) for part in (*NEEDED, *SEMANTIC * semantic))
+        or all(is_compiled(part) for part in (*NEEDED, *SEMANTIC * semantic))
     ):
         yield
         return
@@ -167,24 +165,22 @@ def rehearsed(n_threads: int, semantic: bool) -> Iterator[None]:
     with ExitStack() as processes:
         if not any(is_locked(part) for part in before):
             chains = [[part for part in chain if part in before] for chain in SIDE_BY_SIDE]
-            for process in [processes.enter_context(beside(chain)) for chain in chains]:
+            for process in [processes.enter_context(compiler_process(chain)) for chain in chains]:
                 process.join()
         for part in before:
-            once(part)
-        followers = [processes.enter_context(beside([part])) for part in behind]
+            compile_once(part)
+        followers = [processes.enter_context(compiler_process([part])) for part in behind]
         yield
         for process in followers:
             process.join()
 
 
 @contextmanager
-def beside(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
-    """A process that rehearses parts, and ends with the block; forked from one that is ready to
-    compile.
-    """
+def compiler_process(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
+    """A process that compiles parts, and ends with the block; forked with its imports done."""
     context = get_context("forkserver")
     context.set_forkserver_preload(["chebsplat.pipelines.running.compiler"])
-    process = context.Process(target=alone, args=(5, *parts), daemon=True)
+    process = context.Process(target=compile_parts, args=(5, *parts), daemon=True)
     process.start()
     try:
         yield process
@@ -193,14 +189,12 @@ def beside(parts: Sequence[Callable[[], None]]) -> Iterator[BaseProcess]:
         process.join()
 
 
-def alone(niceness: int, *parts: Callable[[], None]) -> None:
-    """Rehearse parts in a process of its own, which gives way to others and ends with the one that
-    asked for it.
-    """
+def compile_parts(niceness: int, *parts: Callable[[], None]) -> None:
+    """Compile parts in a low-priority process, which ends with its parent."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.nice(niceness)
     for part in parts:
-        once(part)
+        compile_once(part)
 
 
 def _end_with_parent() -> None:
@@ -210,20 +204,18 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def once(part: Callable[[], None]) -> None:
-    """Rehearse a part unless that was done; another process that is at it is waited for, where
-    files can be locked.
-    """
+def compile_once(part: Callable[[], None]) -> None:
+    """Compile a part unless it is cached; waits for another process that does, by a lock."""
     with open(_lock(part), "w") as lock:
         with suppress(OSError):
             fcntl.flock(lock, fcntl.LOCK_EX)
-        if not is_kept(part):
+        if not is_compiled(part):
             part()
             _mark(part).touch()
 
 
 def is_locked(part: Callable[[], None]) -> bool:
-    """Whether another process is at a part."""
+    """True where another process is compiling a part."""
     with open(_lock(part), "w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -234,8 +226,8 @@ def is_locked(part: Callable[[], None]) -> bool:
     return False
 
 
-def is_kept(part: Callable[[], None]) -> bool:
-    """Whether what a part needs was compiled, and is kept."""
+def is_compiled(part: Callable[[], None]) -> bool:
+    """True where the kernels of a part are in the cache."""
     return _mark(part).exists()
 
 

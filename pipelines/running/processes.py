@@ -16,10 +16,10 @@ from types import FrameType
 
 from chebsplat.stages.runtime.stopping import PATIENCE
 
-# Snakemake's own words go to a file; its jobs inherit the real stderr, which may be a terminal. Its
-# standard input is a pipe that ends with the run, however that ends: its session is then stopped,
-# and killed if it does not listen. Its cache lies beside its other files, not in the home folder,
-# which may be full or read-only.
+# Snakemake's own log goes to a file; its jobs inherit the real stderr, which may be a terminal. Its
+# standard input is a pipe that closes with the run, however that ends: its session then gets
+# SIGTERM and, after PATIENCE, SIGKILL. Its cache is beside its other files, as the home folder may
+# be full or read-only.
 SNAKEMAKE = """
 import atexit, json, os, signal, subprocess, sys, threading, time
 patience, words, beside, cache = float(sys.argv.pop(1)), *(sys.argv.pop(1) for _ in range(3))
@@ -50,22 +50,25 @@ def snakemake(
 ) -> int:
     """Run Snakemake; returns its exit code when it and all that it has started are gone.
 
-    Args: words: a file for what it says; cache: a folder for its own; environment: variables beside
-      our own; beside: a command of ours that runs meanwhile.
+    Args: words: a file for its log; cache: its cache folder; environment: further variables;
+      beside: a command of ours that runs meanwhile.
     """
     reader, writer = os.pipe()
-    # -P and PYTHONSAFEPATH: a module where the user stands, or in the work folder, is never run
+    # -P and PYTHONSAFEPATH: modules in the current or the work folder are never imported
     command = [sys.executable, "-P", "-c", SNAKEMAKE, str(PATIENCE), str(words), json.dumps(beside)]
     environment = os.environ | {"PYTHONSAFEPATH": "1", **environment}
     with open(reader, "rb") as standard_input, open(writer, "wb"):
         # a session of its own: a terminal's Ctrl-C reaches the run alone, which ends its jobs
         process = subprocess.Popen(
             [*command, str(cache), *arguments],
-            stdin=standard_input, stdout=subprocess.DEVNULL, env=environment, start_new_session=True,
-        )  # fmt: skip
+            stdin=standard_input,
+            stdout=subprocess.DEVNULL,
+            env=environment,
+            start_new_session=True,
+        )
         try:
-            with paused_together(process):
-                while process.poll() is None:  # a signal that another thread takes wakes no `wait`
+            with pause_together(process):
+                while process.poll() is None:  # `wait` does not wake on another thread's signal
                     time.sleep(0.02)
             return process.returncode
         finally:
@@ -74,14 +77,12 @@ def snakemake(
 
 
 @contextmanager
-def paused_together(process: subprocess.Popen[bytes]) -> Iterator[None]:
-    """A terminal's Ctrl-Z, which reaches this process alone, pauses the session of `process` as
-    well.
-    """
+def pause_together(process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """Pass a terminal's Ctrl-Z, which reaches this process alone, to the session of `process`."""
 
     def pause(_number: int, _frame: FrameType | None) -> None:
         os.killpg(process.pid, signal.SIGSTOP)
-        os.kill(os.getpid(), signal.SIGSTOP)  # until someone has us go on
+        os.kill(os.getpid(), signal.SIGSTOP)  # until SIGCONT
         os.killpg(process.pid, signal.SIGCONT)
 
     before = signal.signal(signal.SIGTSTP, pause)
@@ -92,11 +93,11 @@ def paused_together(process: subprocess.Popen[bytes]) -> Iterator[None]:
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
-    """Stop what is left of a process's session, and kill it if it does not listen."""
+    """Send SIGTERM to the remains of a process's session, and SIGKILL after PATIENCE."""
     with suppress(ProcessLookupError):  # it is gone
         for number in (signal.SIGTERM, signal.SIGKILL):
             os.killpg(process.pid, number)
-            os.killpg(process.pid, signal.SIGCONT)  # a stop may come in the middle of a pause
+            os.killpg(process.pid, signal.SIGCONT)  # it may be paused
             until = time.monotonic() + PATIENCE
             while time.monotonic() < until:
                 process.poll()
@@ -105,14 +106,12 @@ def end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def in_turn(command: Callable[[list[str]], None], calls: list[list[str]]) -> int:
-    """Call a command of ours once for each list of arguments, until one fails; returns its exit
-    code, or 0.
+def run_in_turn(command: Callable[[list[str]], None], calls: list[list[str]]) -> int:
+    """Call a command of ours for each list of arguments until one fails; returns its exit code.
 
-    Each has a process of its own, forked from one that has imported what nearly all of them import
-    and done nothing
-    else: a step then begins 1.3 seconds of a processor sooner, which on a cluster pays for what a
-      job costs.
+    Each call has a process of its own, forked from one that has imported the common packages and
+    done nothing else: a step then starts 1.3 processor seconds sooner, which on a cluster pays for
+      grouping steps into a job.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["torch", "numba", "zarr"])
@@ -122,7 +121,7 @@ def in_turn(command: Callable[[list[str]], None], calls: list[list[str]]) -> int
         try:
             process.join()
         finally:
-            process.terminate()  # does nothing to one that has ended
+            process.terminate()  # without effect on an ended one
             process.join(PATIENCE)
             process.kill()
         if process.exitcode:

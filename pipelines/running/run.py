@@ -17,35 +17,34 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.formats.files import atomic_write, explained
+from chebsplat.pipelines.planning.forecast import forecast, sentence
 from chebsplat.pipelines.planning.plan import Plan, Step
 from chebsplat.pipelines.running import cluster, job, processes
 from chebsplat.pipelines.work import heads, leases, store, summary
 from chebsplat.pipelines.work.store import say
-from chebsplat.pipelines.work.summary import aligned
+from chebsplat.pipelines.work.summary import align_columns
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.device import resolve
+from chebsplat.stages.runtime.progress import is_verbose
 
-HERE = Path(__file__).parents[1]  # of the Snakefile
+HERE = Path(__file__).parents[1]  # the Snakefile's folder
 
 
 @dataclass
 class Outcome:
-    """Exit code of a run (the highest of its steps'), and which steps failed: key -> (exit code,
-    last word, log).
-    """
+    """Exit code of a run (its steps' highest); failed steps: key -> (code, last line, log)."""
 
     code: int = 0
     failed: dict[str, tuple[int, str, Path]] = field(default_factory=dict)
 
 
-def device_of(wanted: str, on: str = cluster.LOCAL) -> str:
-    """What `--device` means to all jobs of a run; says once why it is not the GPU that is there.
-    Whether a cluster's
-    nodes have one is for them to say: a job that asks in vain ends with exit code 2.
+def device_of(requested: str, on: str = cluster.LOCAL) -> str:
+    """The device of all jobs of a run; a line says why it is not the GPU that is there. On a
+    cluster the nodes decide: a job that requests a GPU in vain ends with exit code 2.
     """
-    if on != cluster.LOCAL and wanted == "cuda":
-        return wanted
-    device, why = resolve(wanted)
+    if on != cluster.LOCAL and requested == "cuda":
+        return requested
+    device, why = resolve(requested)
     if why:
         say(why)
     return device
@@ -54,15 +53,21 @@ def device_of(wanted: str, on: str = cluster.LOCAL) -> str:
 def execute(
     plans: list[Plan], stage: str | None, cores: int, device: str = "cpu", on: str = cluster.LOCAL
 ) -> int:
-    """Bring plans up to date, up to `stage`; prints where the last artifact (the report's page) is
-    on stdout.
-    """
-    steps = {step.key: step for plan in plans for step in wanted_steps(plan, stage, plans)}
+    """Bring plans up to date, up to `stage`; prints the path of the report or last artifact."""
+    steps = {step.key: step for plan in plans for step in needed_steps(plan, stage, plans)}
     stale = [step for step in steps.values() if not step.fresh]
     for plan in plans:
+        awaited = [step for step in plan.steps if step.key in steps and not step.fresh]
+        estimate = forecast(plan, awaited, cores, device)
+        for step in awaited:
+            step.expected = estimate.seconds[step.stage] if estimate else None
+        say(f"{plan.title}: {sentence(plan, estimate, cores, device)}")
         say(f"{plan.title}: {plan.source}")
-        for what, why in plan.left_out.items():
-            say(f"  left out: {what} ({why})")
+        if is_verbose():
+            for what, why in plan.left_out.items():
+                say(f"  left out: {what} ({why})")
+        elif "teacher" in plan.left_out:
+            say(f"  colour only, without labels: {plan.left_out['teacher']}")
     code = 0
     try:
         if stale:
@@ -71,7 +76,7 @@ def execute(
                 f"{len(steps) - len(stale)}"
             )
             code = snakemake(stale, cores, device=device, on=on).code
-    finally:  # a run that is stopped names what it has finished
+    finally:  # a stopped run links its finished steps
         for plan in plans:
             store.link(plan.title, plan.targets)
             add_lesson(plan)
@@ -85,21 +90,17 @@ def execute(
 
 
 def add_lesson(plan: Plan) -> None:
-    """The lesson of a scene, if its run has made one, joins the set that scenes after it start
-    from.
-    """
-    made = plan.lesson
-    if made is not None and made.lessons is not None and store.is_fresh(made.path):
-        heads.add(made.lessons, made.path, made.capture, made.start, made.scene)
+    """Add a scene's lesson, if its run has made one, to the set that later scenes start from."""
+    lesson = plan.lesson
+    if lesson is not None and lesson.lessons is not None and store.is_fresh(lesson.path):
+        heads.add(lesson.lessons, lesson.path, lesson.capture, lesson.start, lesson.scene)
 
 
 def say_result(plan: Plan, stage: str | None) -> None:
-    """What a scene has come to, and where it lies: the report's page, or what was asked for
-    last.
-    """
+    """Report a scene's figures and doubts, and print the path of its report or last stage."""
     last = next(step for step in reversed(plan.steps) if stage in (None, step.stage))
     if last.stage == "report":
-        for line in aligned(summary.table(plan.targets["evaluate"])):
+        for line in align_columns(summary.table(plan.targets["evaluate"])):
             say(f"  {line}")
         for doubt in summary.doubts(plan.targets):
             say(f"  doubtful: {doubt}")
@@ -107,17 +108,15 @@ def say_result(plan: Plan, stage: str | None) -> None:
     print(summary.readable(link / "report.html" if last.stage == "report" else link))
 
 
-def wanted_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> list[Step]:
-    """All steps of a plan, or its `stage`, and what they need, of other plans too."""
+def needed_steps(plan: Plan, stage: str | None, others: Iterable[Plan] = ()) -> list[Step]:
+    """All steps of a plan, or its `stage` alone, with those they need, of other plans too."""
     by_path = {step.path: step for some in (*others, plan) for step in some.steps}
-    asked = {stage} if stage else {step.stage for step in plan.steps}
-    waiting, needed = [step for step in plan.steps if step.stage in asked], set()
-    while waiting:
-        step = waiting.pop()
+    stages = {stage} if stage else {step.stage for step in plan.steps}
+    queue, needed = [step for step in plan.steps if step.stage in stages], set()
+    while queue:
+        step = queue.pop()
         needed.add(step.key)
-        waiting += [
-            by_path[path] for path in (*step.inputs.values(), *step.after) if path in by_path
-        ]
+        queue += [by_path[path] for path in (*step.inputs.values(), *step.after) if path in by_path]
     return [step for step in by_path.values() if step.key in needed]
 
 
@@ -131,8 +130,8 @@ def snakemake(
     """Run these steps; logs of those that fail stay in `work/.plans`.
 
     Args: threads: of one job, so that cores // threads run at once; `evaluate`, where it measures
-      frames per second,
-          then runs alone. None: every job may use all cores. on: of `cluster.profile`.
+      frames per second, then runs alone. None: every job may use all cores. on: of
+      `cluster.profile`.
     """
     state = git_state(HERE)
     entries = [entry(step, state, device) for step in steps]
@@ -169,7 +168,7 @@ def snakemake(
             return failures(steps, folder, words) if code else Outcome()
         finally:
             if code != 0 and on != cluster.LOCAL:
-                cluster.withdraw(plan, on)
+                cluster.cancel_jobs(plan, on)
             elif code != 0:
                 store.remove_halves([step.path for step in steps])
             if not code:
@@ -182,7 +181,7 @@ def plan_of(entries: list[dict[str, Any]], on: str = cluster.LOCAL) -> Iterator[
     `clean-stale` on any machine spares what it names.
     """
     folder = store.work() / ".plans" / f"{uuid.uuid4().hex[:16]}-{os.getpid()}"
-    with leases.held(store.run_lease(folder)):
+    with leases.hold(store.run_lease(folder)):
         yield write_plan(folder, entries, cluster.jobs_of(entries, on))
 
 
@@ -218,7 +217,9 @@ def failures(steps: list[Step], folder: Path, words: Path) -> Outcome:
             failed[step.key], killed = (1, "killed before it could report", log), True
             say(f"{step.stage} was killed before it could report; log: {log}")
     if killed or not failed:
-        with explained(store.work()):  # whoever failed could not say whether the disk is full
+        with explained(
+            store.work()
+        ):  # find out if the disk is full, which the failed job could not report
             atomic_write(folder / "room", bytes(1 << 20))
             (folder / "room").unlink()
     if not failed:
@@ -233,25 +234,27 @@ def last_word(log: Path) -> str:
 
 
 def git_state(root: Path) -> dict[str, Any]:
-    """{"commit", "dirty"} of the checkout that the layer `root` belongs to; empty where it is
-    installed.
+    """{"commit", "dirty"} of the checkout that the layer `root` belongs to; empty if installed.
 
-    Choices: a repository around an environment that chebsplat is installed in is none of ours:
-      neither is its commit recorded, nor git started in it, which runs what its settings name.
+    Choices: a repository around an environment that chebsplat is installed in is not ours: git,
+      which runs programs that a repository's settings name, is not started in it.
     """
     if not (root.parent / ".git").exists():
         return {}
     try:
-        run = {"cwd": root, "capture_output": True, "text": True, "check": True}
-        commit = subprocess.run(["git", "rev-parse", "HEAD"], **run).stdout.strip()  # type: ignore[call-overload]
-        status = subprocess.run(["git", "status", "--porcelain"], **run).stdout.strip()  # type: ignore[call-overload]
+        commit, status = (
+            subprocess.run(
+                ["git", *words], cwd=root, capture_output=True, text=True, check=True
+            ).stdout.strip()
+            for words in (("rev-parse", "HEAD"), ("status", "--porcelain"))
+        )
     except (OSError, subprocess.CalledProcessError):
         return {}
     return {"commit": commit, "dirty": bool(status)}
 
 
 def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, Any]:
-    """A step as the Snakefile and the job read it."""
+    """A step as a JSON-able entry for the Snakefile and the job."""
     return {
         "stage": step.stage,
         "key": step.key,
@@ -262,13 +265,12 @@ def entry(step: Step, state: dict[str, Any], device: str = "cpu") -> dict[str, A
         "code": step.code | state,
         "raw": step.raw,
         "device": STAGES[step.stage].device(device, step.sections),
+        "expected": step.expected,
     }
 
 
 def rehearsal_command(entries: list[dict[str, Any]]) -> list[str]:
-    """What compiles kernels while these steps run: nothing, if no training on the processor is
-    among them.
-    """
+    """The command that compiles kernels during a run; empty without a CPU training in it."""
     trained = [
         entry for entry in entries if entry["stage"] == "train" and entry["device"] != "cuda"
     ]
@@ -286,7 +288,7 @@ def rehearsal_command(entries: list[dict[str, Any]]) -> list[str]:
 
 
 def job_command(plan: Path, of_job: dict[str, Any]) -> str:
-    """The shell line of a job, its steps one after the other; a signal meets no shell before it."""
+    """The shell line of a job; `exec` so that signals reach it and not a shell."""
     command = [
         sys.executable,
         "-P",
@@ -299,7 +301,7 @@ def job_command(plan: Path, of_job: dict[str, Any]) -> str:
 
 
 def seconds(steps: list[Step], ran: set[str]) -> None:
-    """Seconds of each stage, from the manifests; what did not run now says so."""
+    """Report seconds of each stage, from the manifests, and which ran before this run."""
     total = 0.0
     for step in steps:
         spent = json.loads((step.path / "artifact.json").read_text())["seconds"]

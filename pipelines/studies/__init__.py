@@ -1,4 +1,4 @@
-"""Studies: the planning and running of many scenes (`study`), and what comes of them.
+"""Studies: many scenes planned and run (`study`), and the figures, tables and pages of their runs.
 
 A run's figures are a `Row` with the COLUMNS of `results`; its scores lie in [0, 1], and tables show
 them in per cent. `results` compares variants; `page` writes all, with `tables`, `figures` (charts)

@@ -16,8 +16,8 @@ MARKERS = "osD^vP*X<>"
 Traces = list[tuple[Row, list[dict[str, float]]]]
 
 
-def drawn(name: str) -> str:
-    """A name as matplotlib draws it: without mathematics, and with a place in the legend."""
+def escape_name(name: str) -> str:
+    """A name escaped for matplotlib: no mathematics, and never hidden from the legend."""
     return (" " if name.startswith("_") else "") + name.replace("$", r"\$")
 
 
@@ -31,10 +31,14 @@ def draw(
     """
     matplotlib.use("Agg")
 
-    done = [row for row in rows if row["state"] == "done"]
+    finished = [row for row in rows if row["state"] == "done"]
     variants = list(dict.fromkeys(row["variant"] for row in rows))
     style = {
-        name: {"color": f"C{k % 10}", "marker": MARKERS[k % len(MARKERS)], "label": drawn(name)}
+        name: {
+            "color": f"C{k % 10}",
+            "marker": MARKERS[k % len(MARKERS)],
+            "label": escape_name(name),
+        }
         for k, name in enumerate(variants)
     }
     conditions = (
@@ -43,24 +47,26 @@ def draw(
         else list(dict.fromkeys(row["condition"] for row in rows)) or [""]
     )
     height = 3.4 * len(conditions) + 0.3 * -(-len(variants) // 5)
-    color_only = settings is None and bool(done) and all(row["miou"] is None for row in done)
-    scenes = list(dict.fromkeys(row["scene"] for row in done))
+    color_only = (
+        settings is None and bool(finished) and all(row["miou"] is None for row in finished)
+    )
+    scenes = list(dict.fromkeys(row["scene"] for row in finished))
     n, width = (len(scenes), max(3.2 * len(scenes), 5)) if color_only else (3, 12)
     figure, axes = plt.subplots(
         len(conditions), n, figsize=(width, height), layout="constrained", squeeze=False
     )
     for line, condition in zip(axes, conditions, strict=True):
-        chosen = [row for row in done if row["condition"] == condition]
+        members = [row for row in finished if row["condition"] == condition]
         followed = [(row, trace) for row, trace in traces if row["condition"] == condition]
         if settings is not None:
-            _over_setting(line, done, settings, style, label)
+            _over_setting(line, finished, settings, style, label)
         elif color_only:
             for axis, scene in zip(line, scenes, strict=True):
-                _of_scene(axis, scene, chosen, followed, style)
-            line[0].set_ylabel(f"PSNR, dB {drawn(condition)}".strip())
+                _of_scene(axis, scene, members, followed, style)
+            line[0].set_ylabel(f"PSNR, dB {escape_name(condition)}".strip())
         else:
-            _over_time(line, chosen, followed, style)
-            line[0].set_ylabel(drawn(condition))
+            _over_time(line, members, followed, style)
+            line[0].set_ylabel(escape_name(condition))
         for axis in line:
             axis.grid(alpha=0.3)
     handles = {
@@ -79,9 +85,7 @@ def draw(
 def _mean_line(
     axis: Any, points: list[tuple[Any, list[float], list[float]]], style: dict[str, Any]
 ) -> None:
-    """A line through means, with the spread of the values as bars. points: (order, x values, y
-    values).
-    """
+    """A line through means, spreads as bars. points: (order, x values, y values)."""
     if not points:
         return
     points = sorted(points, key=lambda point: float(np.mean(point[1])))
@@ -96,9 +100,7 @@ def _mean_line(
 def _over_time(
     line: Any, rows: list[Row], traces: Traces, style: dict[str, dict[str, Any]]
 ) -> None:
-    """Test PSNR and mIoU over training seconds, a point a budget; held-in PSNR along the longest
-    trainings.
-    """
+    """Test PSNR and mIoU over training seconds, a point a budget; held-in PSNR of the longest."""
     titles = (("psnr", "test PSNR, dB", 1), ("miou", "test mIoU, %", 100))
     for axis, (key, title, scale) in zip(line, titles, strict=False):
         _over_budgets(axis, rows, key, scale, style)
@@ -112,14 +114,12 @@ def _over_time(
 def _of_scene(
     axis: Any, scene: str, rows: list[Row], traces: Traces, style: dict[str, dict[str, Any]]
 ) -> None:
-    """Of a scene without semantics: test PSNR by budget, and as thin lines that of training views
-    as they train.
-    """
+    """A scene without semantics: test PSNR by budget, training views' PSNR as thin lines."""
     _over_budgets(axis, [row for row in rows if row["scene"] == scene], "psnr", 1, style)
     _longest(axis, [(row, trace) for row, trace in traces if row["scene"] == scene], style)
     axis.set_xscale("log")
     axis.xaxis.set_major_formatter("{x:g}")
-    axis.set_title(drawn(scene), fontsize=10)
+    axis.set_title(escape_name(scene), fontsize=10)
     axis.set_xlabel("training seconds (thin: views trained on)", fontsize=9)
 
 
@@ -127,8 +127,8 @@ def _over_budgets(
     axis: Any, rows: list[Row], key: str, scale: float, style: dict[str, dict[str, Any]]
 ) -> None:
     """A line a variant through the means of a figure, a point a budget."""
-    known = [row for row in rows if row[key] is not None and row["train_seconds"] is not None]
-    for (variant,), members in groups(known, "variant").items():
+    measured = [row for row in rows if row[key] is not None and row["train_seconds"] is not None]
+    for (variant,), members in groups(measured, "variant").items():
         budgets = groups(members, "budget")
         points = [
             (name, [row["train_seconds"] for row in some], [scale * row[key] for row in some])
@@ -138,9 +138,7 @@ def _over_budgets(
 
 
 def _longest(axis: Any, traces: Traces, style: dict[str, dict[str, Any]]) -> None:
-    """PSNR of the watched training views along the longest training of each variant, or those as
-    long.
-    """
+    """PSNR of the watched training views along the longest trainings of each variant."""
     longest: dict[str, int] = {}
     for row, _ in traces:
         longest[row["variant"]] = max(longest.get(row["variant"], 0), row["steps"])
@@ -156,8 +154,11 @@ def _over_setting(
     line: Any, rows: list[Row], settings: dict[str, float], style: dict[str, Any], label: str
 ) -> None:
     """mIoU of the scene and of its teacher, their difference, and PSNR, over a setting."""
-    titles = (("miou", "test mIoU, %", 100), ("miou_gain", "mIoU − its 2D teacher's, points", 100),
-              ("psnr", "test PSNR, dB", 1))  # fmt: skip
+    titles = (
+        ("miou", "test mIoU, %", 100),
+        ("miou_gain", "mIoU − its 2D teacher's, points", 100),
+        ("psnr", "test PSNR, dB", 1),
+    )
     for axis, (key, title, scale) in zip(line, titles, strict=True):
         for (variant,), members in groups(
             [row for row in rows if row[key] is not None], "variant"
@@ -170,10 +171,10 @@ def _over_setting(
             _mean_line(axis, points, style[variant])
         axis.set_title(title, fontsize=10)
         axis.set_xlabel(label)
-    known = groups([row for row in rows if row["miou_teacher"] is not None], "condition")
+    by_condition = groups([row for row in rows if row["miou_teacher"] is not None], "condition")
     points = [
         (name, [settings[name]], [100 * row["miou_teacher"] for row in some])
-        for (name,), some in known.items()
+        for (name,), some in by_condition.items()
     ]
     _mean_line(
         line[0],

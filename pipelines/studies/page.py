@@ -1,4 +1,4 @@
-"""What a study leaves behind: results.csv, results.md, the picture, and one self-contained page."""
+"""The results of a study as files: results.csv, results.md, the picture, a self-contained page."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from chebsplat.pipelines.studies.tables import (
 from chebsplat.stages.pages.parts import rendered
 from chebsplat.stages.report import LARGEST
 
-PAGE = Path(__file__).with_name("page.html")  # a jinja2 template; it fetches nothing from anywhere
+PAGE = Path(__file__).with_name("page.html")  # a jinja2 template without external resources
 NAME = "study.html"
 PICTURE = "error-against-time.png"
-# what Markdown takes for its own
+# Markdown's special characters
 MARKUP = re.compile(r"([\\`*_{}\[\]|~$^#])|^(\d*)([-+=.)])(?=[\s=-]|$)")
-NARROW = 1100  # pixels of a screen; the comparison's tables take more
+NARROW = 1100  # pixels of a screen that is narrower than the comparison's tables
 
 
 def write(
@@ -47,8 +47,7 @@ def write(
     command: str,
     more: Sequence[Section] = (),
 ) -> Path:
-    """Fill `out`; returns the page. Runs that failed or have not run are named, and count in no
-    mean.
+    """Fill `out`; returns the page. Failed and missing runs are named, and in no mean.
 
     Args: more: further sections.
     """
@@ -102,7 +101,7 @@ def settings_of(study: Study) -> dict[str, float]:
 
 
 def note(study: Study, rows: list[Row]) -> str:
-    """How to read the table."""
+    """The caption of the comparison's table."""
     n_scenes = len({row["scene"] for row in rows})
     unit = (
         f"Student's over the {n_scenes} scenes"
@@ -122,9 +121,9 @@ def note(study: Study, rows: list[Row]) -> str:
 
 
 def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str]]:
-    """Where the figures come from."""
-    done = [(run, row) for run, row in zip(runs, rows, strict=True) if row["state"] == "done"]
-    manifests = [artifact.read_manifest(run.plan.targets["train"]) for run, _ in done]
+    """Provenance of the figures: command, protocol, machines, versions, commit."""
+    finished = [(run, row) for run, row in zip(runs, rows, strict=True) if row["state"] == "done"]
+    manifests = [artifact.read_manifest(run.plan.targets["train"]) for run, _ in finished]
     loads = [value for m in manifests for process in m.processes for value in process["load"]]
     versions = {f"{k} {v}" for m in manifests for k, v in m.versions.items()}
     commits = {
@@ -137,7 +136,7 @@ def facts(runs: list[Run], rows: list[Row], command: str) -> list[tuple[str, str
         ("protocol", ", ".join(sorted({row["protocol"] for row in rows}))),
         (
             "runs",
-            f"{len(done)} of {len(rows)} done; {len({m.key for m in manifests})} different "
+            f"{len(finished)} of {len(rows)} done; {len({m.key for m in manifests})} different "
             "trainings",
         ),
         ("device", ", ".join(sorted({m.device for m in manifests}))),
@@ -154,14 +153,14 @@ def inert(text: str) -> str:
 
 
 def markdown(parts: dict[str, Any]) -> str:
-    """The study's section of docs/results/. Whatever others have named is `inert`."""
+    """The study's section of docs/results/; names from outside are made `inert`."""
     study = parts["study"]
     text = [f"## {inert(study.title)}", "", inert(study.about), ""]
     text += [f"- {what}: {inert(value)}" for what, value in parts["facts"]]
     text += ["", f"![error against run time]({PICTURE})", "", inert(parts["note"]), ""]
-    shown = [[(inert(a), b, bold) for a, b, bold in row] for _, row in parts["table"]]
+    cells = [[(inert(a), b, bold) for a, b, bold in row] for _, row in parts["table"]]
     rows = [
-        [f"{a}<br>{f'**{b}**' if bold else b}" if b else a for a, b, bold in row] for row in shown
+        [f"{a}<br>{f'**{b}**' if bold else b}" if b else a for a, b, bold in row] for row in cells
     ]
     tables = [("", "", [parts["header"], *rows])]
     more = [(f"### {inert(s.heading)}", s.note, s.table) for s in parts["more"]]

@@ -1,6 +1,4 @@
-"""What a study looks like: one view of every scene as each variant renders and labels it, and IoU
-by class.
-"""
+"""Pictures of a study: one view of every scene rendered and labelled by each variant; class IoU."""
 
 from __future__ import annotations
 
@@ -20,8 +18,7 @@ LONGEST = 480  # side of a picture, pixels
 
 
 def gallery(study: Study, runs: list[Run], rows: list[Row]) -> dict[str, Any]:
-    """The values of the slider and the bars: `pictures`, `modes`, `legend`, `classes`, and `shown`
-    in words.
+    """Values of the page's slider and bars: `pictures`, `modes`, `legend`, `classes`, `shown`.
 
     Choices: of every scene the middle one of its evaluated views, under the first condition, the
       last budget and the first seed; every run's class IoU under that condition and budget counts.
@@ -82,18 +79,16 @@ def _names(runs: dict[str, Run]) -> list[str]:
 def _images(
     evaluations: dict[str, Evaluation], table: np.ndarray, n: int
 ) -> tuple[list[tuple[str, str, str]], Counter[int]]:
-    """(key, URI, caption) of a scene's pictures, pixels of each of n labels in them. table: its
-    labels -> these.
-    """
+    """(key, URI, caption) of pictures, and pixels by label. table: to the union's labels."""
     first = next(iter(evaluations.values()))
     view = len(first.figures["names"]) // 2
     pixels: Counter[int] = Counter()
     images = [("truth", draw.data_uri(_small(first.pictures["truth"][view]), photo=True), "photo")]
 
     def labels(key: str, stack: Any, caption: str) -> None:
-        shown = table[_small(stack[view])]
-        pixels.update(counted(shown))
-        images.append((key, draw.data_uri(draw.colored(shown, n)), caption))
+        label_ids = table[_small(stack[view])]
+        pixels.update(counted(label_ids))
+        images.append((key, draw.data_uri(draw.colored(label_ids, n)), caption))
 
     if "labels" in first.pictures:
         labels("labels", first.pictures["labels"], "true labels")
@@ -109,9 +104,7 @@ def _images(
 
 
 def _small(image: np.ndarray) -> np.ndarray:
-    """At a whole fraction of its size, so that no side exceeds LONGEST: mean colours, every k-th
-    label.
-    """
+    """An image reduced by a whole factor to at most LONGEST: mean colours, every k-th label."""
     step = -(-max(image.shape[:2]) // LONGEST)
     return (
         np.asarray(Image.fromarray(image).reduce(step))
@@ -121,9 +114,7 @@ def _small(image: np.ndarray) -> np.ndarray:
 
 
 def _modes(baseline: str, variants: list[str]) -> list[list[Any]]:
-    """What the slider can compare: photo and truth with the first variant, and the baseline with
-    photo and each.
-    """
+    """Pairs to compare: photo and truth with the first variant, the baseline with the others."""
 
     def of(variant: str, what: bool) -> dict[str, str | None]:
         return side(variant, f"render of {variant}", f"labels of {variant}" if what else None)
@@ -149,11 +140,11 @@ def _classes(
 ) -> list[tuple]:
     """(class, colour, the variant's mean IoU over scenes and seeds, the baseline's), best first."""
 
-    def means(wanted: str) -> dict[str, float]:
+    def means(selected: str) -> dict[str, float]:
         values_of: dict[str, list[float]] = {}
         for run, row in of_interest:
             for name, value in row["segmentation"].get("scene", {}).get("iou", {}).items():
-                if run.variant == wanted and value is not None:
+                if run.variant == selected and value is not None:
                     values_of.setdefault(name, []).append(value)
         return {name: float(np.mean(values)) for name, values in values_of.items()}
 

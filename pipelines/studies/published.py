@@ -1,30 +1,29 @@
-"""Tables of a paper: its figures beside those of the runs that stand for them, or why there are
-none.
-"""
+"""Tables of a paper: its figures beside those of our runs, or the reason why there are none."""
 
 from __future__ import annotations
 
 from chebsplat.evaluation import protocols
 from chebsplat.pipelines.studies.results import FIGURES, Figure, Line, Row, compare
-from chebsplat.pipelines.studies.study import Study, lacking
+from chebsplat.pipelines.studies.study import Study, list_missing
 from chebsplat.pipelines.studies.tables import Section, mean_text
 from chebsplat.stages.runtime.config import build
 
 
 def published_sections(study: Study, rows: list[Row]) -> list[Section]:
-    """A section for each of a study's tables: a row for each method of the paper and each variant
-    of ours.
+    """A section for each of a study's tables: a row a method of the paper and a row a variant.
 
-    A row has the paper's and our value of each figure that the paper gives, the runs that are done,
-    and why scenes are lacking. The note says under which protocol both are measured.
+    A row has the paper's and our value of each published figure, the finished runs, and why scenes
+    are missing. The note gives the protocol of both.
     """
     lines = {(line.condition, line.variant): line for line in compare(rows, study.baseline)}
     sections = []
     for condition, table in study.tables.items():
-        given = {key for figures in table.published.values() for key in figures}
-        shown = [figure for figure in FIGURES if figure.key in given]
+        published_keys = {key for figures in table.published.values() for key in figures}
+        columns = [figure for figure in FIGURES if figure.key in published_keys]
         body = [["in the paper", "here", "runs"]]
-        body[0] += [heading for figure in shown for heading in (f"{figure.heading}: paper", "here")]
+        body[0] += [
+            heading for figure in columns for heading in (f"{figure.heading}: paper", "here")
+        ]
         body[0] += ["not run, and why"]
         stands = {row: variant for variant, row in table.variants.items() if row}
         methods = [(row, stands.get(row, "")) for row in table.published]
@@ -33,16 +32,16 @@ def published_sections(study: Study, rows: list[Row]) -> list[Section]:
             *(("", name) for name, of in table.variants.items() if not of),
         ]:
             line = lines.get((condition, variant))
-            reasons = lacking(study, condition, variant) if variant else {}
+            reasons = list_missing(study, condition, variant) if variant else {}
             cells = [row or "-", variant or "-", f"{line.n_done} of {line.n_runs}" if line else "-"]
-            for figure in shown:
+            for figure in columns:
                 cells += _cells(table.published.get(row, {}), line, figure)
             listed = {
                 why: "all" if of == table.scenes else ", ".join(of) for why, of in reasons.items()
             }
             body.append([*cells, "; ".join(f"{of}: {why}" for why, of in listed.items()) or "-"])
-        done = [row for row in rows if row["condition"] == condition and row["state"] == "done"]
-        sections.append(Section(condition, _note(study, condition, done), body))
+        finished = [row for row in rows if row["condition"] == condition and row["state"] == "done"]
+        sections.append(Section(condition, _note(study, condition, finished), body))
     return sections
 
 
@@ -53,8 +52,8 @@ def _cells(paper: dict[str, float], line: Line | None, figure: Figure) -> list[s
     return [theirs, mean_text(own, figure) if own else "-"]
 
 
-def _note(study: Study, condition: str, done: list[Row]) -> str:
-    """The protocol of a table as it is asked for, and resolution and split as its runs had them."""
+def _note(study: Study, condition: str, finished: list[Row]) -> str:
+    """The protocol of a table as configured, and the resolution and split of its finished runs."""
     ingest = build(study.conditions[condition], condition).ingest
     rule = protocols.ALL[ingest.protocol]
     split = f"view index % {rule.TEST_EVERY} == {rule.TEST_OFFSET} is test"
@@ -65,5 +64,5 @@ def _note(study: Study, condition: str, done: list[Row]) -> str:
     views = f", {ingest.max_views} views a scene" if ingest.max_views else ""
     text = f"Protocol {rule.NAME}: {split}, {ingest.max_side} pixels at most{views}; scenes "
     text += f"{', '.join(study.tables[condition].scenes)}."
-    used = sorted({f"{row['resolution']} ({row['split']})" for row in done})
+    used = sorted({f"{row['resolution']} ({row['split']})" for row in finished})
     return text + (f" Measured at {'; '.join(used)}." if used else "")

@@ -1,6 +1,4 @@
-"""What a study found: one row a run, read from the artifacts, and the comparison of its
-variants.
-"""
+"""Results of a study: one row a run, read from the artifacts, and the comparison of variants."""
 
 from __future__ import annotations
 
@@ -22,16 +20,14 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Figure:
-    """A column: its key in a row, its heading, how a value is shown, and whether variants compare
-    by ratio.
-    """
+    """A column: its key in a row, heading, format, and whether variants compare by ratio."""
 
     key: str
     heading: str
     digits: int
     scale: float = 1.0
     ratio: bool = False
-    timed: str = ""  # the column that names the machine which it was measured on
+    timed: str = ""  # the column with the machine that it was measured on
 
 
 FIGURES = (
@@ -56,22 +52,22 @@ FIGURES = (
     Figure("frames_per_second", "frames/s", 1, 1, True, "rendered_on"),
     Figure("train_seconds", "training, s", 1, 1, True, "trained_on"),
 )
-OF_TEACHER = ("miou", "boundary_miou", "point_miou")  # figures of single photos, too
+OF_TEACHER = ("miou", "boundary_miou", "point_miou")  # figures of the teacher on single photos, too
 OTHERS = (
-    *(f"{key}_teacher" for key in OF_TEACHER), "classes", "pixels", "protocol", "resolution", "split", "held_in_psnr",
-    "steps", "clock", "device", "trained_on", "rendered_on", "train_key", "evaluate_key",
+    *(f"{key}_teacher" for key in OF_TEACHER), "classes", "pixels", "protocol", "resolution",
+    "split", "held_in_psnr", "steps", "clock", "device", "trained_on", "rendered_on", "train_key",
+    "evaluate_key",
 )  # fmt: skip
 IDENTITY = ("condition", "variant", "budget", "scene", "seed", "state")
-# what a protocol may work out over all scenes together
+# figures that a protocol may compute over all scenes
 POOLED = ("miou", "miou_gain", "macc", "oa")
 COLUMNS = (*IDENTITY, *(figure.key for figure in FIGURES), *OTHERS)
 
 
 def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
-    """One run's figures; None where a thing was not measured. `state` is `done`, or why there are
-    none.
+    """One run's figures; None where not measured. `state` is `done`, or why there are none.
 
-    Beside the COLUMNS it holds `segmentation`, all that the protocol says of the scene and of its
+    Beside the COLUMNS it holds `segmentation`, all the protocol's figures of the scene and of its
     teacher, and `left_out`.
 
     Args: failed: of `Outcome`. Raises: InputError naming a damaged artifact.
@@ -92,9 +88,9 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     figures = read_figures(targets["evaluate"], evaluation)
     trace = read_trace(targets["train"], train)
     segmentation = figures.get("segmentation") or {}
-    row |= segmented(segmentation.get("scene", {}), segmentation.get("teacher", {}))
+    row |= segmentation_columns(segmentation.get("scene", {}), segmentation.get("teacher", {}))
     counts, guidance = scene.facts["by_degree"], train.facts.get("guidance", {})
-    kept = sum(n * (degree + 1) ** 2 for degree, n in enumerate(counts))
+    n_coefficients = sum(n * (degree + 1) ** 2 for degree, n in enumerate(counts))
     return row | {
         "state": "done",
         "segmentation": segmentation,
@@ -107,7 +103,7 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
         "lpips": figures["image"].get("lpips"),
         **{key: figures["protocol"][key] for key in ("resolution", "split")},
         "n_gaussians": figures["n_gaussians"],
-        "sh_kept": kept / (16 * sum(counts)),
+        "sh_kept": n_coefficients / (16 * sum(counts)),
         **{key: guidance.get(key) for key in ("mask_spread", "band_spread")},
         "bytes_ply": figures["bytes"]["ply"],
         "bytes_ragged": figures["bytes"]["ragged"],
@@ -123,39 +119,38 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
 
 
 def on_one_machine(rows: list[Row]) -> tuple[list[Row], list[str]]:
-    """The rows with the seconds and frames/s of one machine alone, that of most finished runs, None
-    elsewhere; and what is left out, in sentences.
+    """Rows with timings of the machine with most finished runs, and sentences on the rest.
 
     Choices: of equally many, the first. A training that ended by the clock of another machine
-      (`clock`) has other figures altogether: it has no part in the comparison, and its `state`
-      says why.
+      (`clock`) has other figures altogether: it has no part in the comparison, and its `state` says
+      why.
     """
-    kept, said = [dict(row) for row in rows], []
-    done = [row for row in kept if row["state"] == "done"]
+    compared, sentences = [dict(row) for row in rows], []
+    finished = [row for row in compared if row["state"] == "done"]
     for figure in FIGURES:
-        if figure.timed and done:
-            (machine, n_here), *others = Counter(row[figure.timed] for row in done).most_common()
+        if figure.timed and finished:
+            (machine, n_here), *others = Counter(
+                row[figure.timed] for row in finished
+            ).most_common()
             if others:
                 left = "; ".join(f"{n} on {name}" for name, n in others)
-                said.append(
+                sentences.append(
                     f"'{figure.heading}' is of the {n_here} runs on {machine} alone; not "
                     f"compared: {left}"
                 )
-            for row in done:
+            for row in finished:
                 if row[figure.timed] != machine:
                     row[figure.key] = None
-    for row in done:
+    for row in finished:
         if row["clock"] and row["train_seconds"] is None:
             row["state"] = (
                 f"its {row['clock']:g} s are of another machine ({row['trained_on']}): not compared"
             )
-    return kept, said
+    return compared, sentences
 
 
-def segmented(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
-    """The columns that figures of a scene and of its teacher fill; a protocol measures some of
-    them.
-    """
+def segmentation_columns(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
+    """Columns from a protocol's figures of a scene and of its teacher; None where not measured."""
     row: Row = {
         key: scene.get(key)
         for key in ("miou", "macc", "oa", "boundary_miou", "rarest_miou", "point_miou")
@@ -167,7 +162,7 @@ def segmented(scene: dict[str, Any], teacher: dict[str, Any]) -> Row:
 
 
 def over_scenes(rows: list[Row]) -> list[Row]:
-    """One row a seed, its POOLED figures those of all its scenes together as the protocol has it.
+    """One row a seed, its POOLED figures computed over all its scenes as the protocol defines.
 
     Args: rows: finished ones of one protocol. The rows themselves, where it has no rule for several
       scenes.
@@ -183,21 +178,22 @@ def over_scenes(rows: list[Row]) -> list[Row]:
         scene, teacher = ({} if None in of_side else rule(of_side) for of_side in sides)
         name = "+".join(sorted(row["scene"] for row in members))
         pooled.append(
-            dict.fromkeys(POOLED) | members[0] | {"scene": name} | segmented(scene, teacher)
+            dict.fromkeys(POOLED)
+            | members[0]
+            | {"scene": name}
+            | segmentation_columns(scene, teacher)
         )
     return pooled
 
 
 def traces(runs: list[Run], rows: list[Row]) -> list[tuple[Row, list[dict[str, float]]]]:
-    """The trace of every finished run, with its row; of runs whose seconds `on_one_machine` leaves
-    out none.
-    """
-    found = []
+    """Row and trace of every finished run, without those that `on_one_machine` leaves out."""
+    traced = []
     for run, row in zip(runs, rows, strict=True):
         if row["state"] == "done" and row["train_seconds"] is not None:
             path = run.plan.targets["train"]
-            found.append((row, read_trace(path, artifact.read_manifest(path))))
-    return found
+            traced.append((row, read_trace(path, artifact.read_manifest(path))))
+    return traced
 
 
 @dataclass(frozen=True)
@@ -224,36 +220,35 @@ def groups(rows: list[Row], *names: str) -> dict[tuple, list[Row]]:
 def compare(rows: list[Row], baseline: str) -> list[Line]:
     """Mean ± spread over scenes and seeds, and paired differences against the baseline.
 
-    Choices: a pair needs both runs: what failed on either side drops out of the difference; the
-      line counts its runs. Where a protocol works out a figure over all scenes together, that of a
-      seed is one value, and needs all of them.
+    Choices: a difference uses pairs of which both runs finished; the line counts its runs. A figure
+      that a protocol computes over all scenes is one value a seed, and needs all scenes.
     """
     by_line = groups(rows, "condition", "budget", "variant")
     lines = []
     for (condition, budget, variant), members in by_line.items():
-        done = [row for row in members if row["state"] == "done"]
+        finished = [row for row in members if row["state"] == "done"]
         against = [
             row for row in by_line.get((condition, budget, baseline), []) if row["state"] == "done"
         ]
-        together = over_scenes(done), over_scenes(against)
+        together = over_scenes(finished), over_scenes(against)
         summaries, differences = {}, {}
         for figure in FIGURES:
-            mine, theirs = together if figure.key in POOLED else (done, against)
+            mine, theirs = together if figure.key in POOLED else (finished, against)
             values = [row[figure.key] for row in mine if row[figure.key] is not None]
             if values:
                 summaries[figure.key] = summarize(values)
-            found = pairs(mine, theirs, figure.key) if variant != baseline else []
-            if found:
-                scenes, own, other = zip(*found, strict=True)
+            paired = pairs(mine, theirs, figure.key) if variant != baseline else []
+            if paired:
+                scenes, own, other = zip(*paired, strict=True)
                 difference = paired_difference(own, other, list(scenes), figure.ratio)
                 differences[figure.key] = difference
         lines.append(
-            Line(condition, budget, variant, len(done), len(members), summaries, differences)
+            Line(condition, budget, variant, len(finished), len(members), summaries, differences)
         )
     return lines
 
 
-def pairs(done: list[Row], against: list[Row], key: str) -> list[tuple[str, float, float]]:
+def pairs(rows: list[Row], against: list[Row], key: str) -> list[tuple[str, float, float]]:
     """(scene, value, the baseline's) of the same scene and seed."""
 
     def place(row: Row) -> tuple:
@@ -262,6 +257,6 @@ def pairs(done: list[Row], against: list[Row], key: str) -> list[tuple[str, floa
     other = {place(row): row[key] for row in against if row[key] is not None}
     return [
         (row["scene"], row[key], other[place(row)])
-        for row in done
+        for row in rows
         if row[key] is not None and place(row) in other
     ]

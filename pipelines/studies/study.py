@@ -1,4 +1,4 @@
-"""Studies: scenes × conditions × variants × budgets × seeds, planned and stored; their progress."""
+"""Studies: scenes × conditions × variants × budgets × seeds, planned, run and reported."""
 
 from __future__ import annotations
 
@@ -19,34 +19,30 @@ from chebsplat.errors import ChebsplatError, ConfigError
 from chebsplat.pipelines.planning.code import PACKAGE
 from chebsplat.pipelines.planning.plan import Plan, Planner, Step, merged, suffix
 from chebsplat.pipelines.running.cluster import LOCAL
-from chebsplat.pipelines.running.run import Outcome, say, snakemake, wanted_steps
+from chebsplat.pipelines.running.run import Outcome, needed_steps, say, snakemake
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import read_named, read_toml, scene_values
 from chebsplat.stages.runtime.config import checked
 from chebsplat.stages.settings import Section, Text, printable
 from chebsplat.stages.sources.common import spellings
 
-LAST = "evaluate"  # a study measures; a page and an ONNX file for each of its runs would be waste
+LAST = "evaluate"  # the last stage of a run: a study needs no page and no ONNX file of each
 
 
 Sections = dict[str, dict[str, Any]]  # of a config; their values are checked where a run is planned
 Name = Annotated[str, Field(max_length=200), AfterValidator(printable)]
-EVERY = 1.0  # seconds between looks at what is finished
-REFRESH = 300.0  # seconds at least between two writings of a study's page while it runs
+EVERY = 1.0  # seconds between polls for finished runs
+REFRESH = 300.0  # least seconds between two writings of the page during a study
 
 
 class Budgets(Section):
-    """What a run may spend. Every budget is a whole training with its own schedule, never a cut of
-    a longer one.
-    """
+    """Budgets of a run. Each is a whole training with its own schedule, never a longer one cut."""
 
     steps: list[Annotated[int, Field(ge=1, le=1_000_000)]] = Field([], max_length=100)
     seconds: list[Annotated[float, Field(ge=0.1, le=604_800)]] = Field([], max_length=100)
 
     def settings(self) -> dict[str, dict[str, Any]]:
-        """train settings by the budget's name; one unnamed budget, the scene's own, where none is
-        given.
-        """
+        """train settings by budget name; without budgets the scene's own, unnamed."""
         settings: dict[str, dict[str, Any]] = {f"{n} steps": {"steps": n} for n in self.steps}
         settings |= {f"{s:g} s": {"seconds": s} for s in self.seconds}
         return settings or {"": {}}
@@ -56,9 +52,9 @@ class Table(Section):
     """A condition that stands for a table of a paper, with scenes and variants of its own.
 
     Scenes lie in the folder that the environment variable `root` names, or one folder below it, and
-    hold `holds`. `teacher`: the variable that names the 2D teacher's model, which is asked for the
-    label set `labels`. `variants` are some of the study's, each with the row of `published` that it
-    stands for, "" for none. `published`: figures by row, in the units that a study shows.
+    hold `holds`. `teacher`: the variable that names the 2D teacher's model, scored by the label set
+      `labels`. `variants` are some of the study's, each with the row of `published` that it stands
+      for, "" for none. `published`: figures by row, in the units that a study shows.
     """
 
     root: Text
@@ -70,12 +66,14 @@ class Table(Section):
     published: dict[Name, dict[str, float]]
 
     def folder(self, scene: str) -> str:
-        """Where a scene lies, ending in "/"; "" where it does not."""
+        """A scene's folder, ending in "/"; "" where there is none."""
         root = Path(os.environ.get(self.root) or os.devnull)
-        found = [
+        candidates = [
             top / name for top in (root, *sorted(root.glob("*/"))) for name in spellings(scene)
         ]
-        return next((f"{path.absolute()}/" for path in found if (path / self.holds).exists()), "")
+        return next(
+            (f"{path.absolute()}/" for path in candidates if (path / self.holds).exists()), ""
+        )
 
     def lacks(self, scene: str, semantic: bool) -> str:
         """Why a scene cannot run, "" where it can. semantic: its variant needs a teacher."""
@@ -89,7 +87,7 @@ class Table(Section):
             else ""
         )
 
-    def taught(self, semantic: bool) -> Sections:
+    def teacher_settings(self, semantic: bool) -> Sections:
         """The settings of the 2D teacher."""
         if not (semantic and self.teacher):
             return {}
@@ -100,7 +98,7 @@ class Table(Section):
 
 
 class Study(Section):
-    """A file of `configs/studies`, alone or over another that it `extends` (`extended`).
+    """A file of `configs/studies`, alone or over another that it `extends` (`extend_study`).
     `settings`, conditions and variants hold config sections.
 
     Conditions are what results are averaged within (a teacher, a noise level); variants are
@@ -166,12 +164,12 @@ class Run:
     scene: str
     seed: int
     plan: Plan = field(compare=False)
-    # of the scenes whose lessons it starts from
+    # plans of the scenes whose lessons it starts from
     before: tuple[Plan, ...] = field(default=(), compare=False)
 
     @property
     def steps(self) -> list[Step]:
-        return wanted_steps(self.plan, LAST, self.before)
+        return needed_steps(self.plan, LAST, self.before)
 
     @property
     def protocol(self) -> str:
@@ -198,10 +196,10 @@ def read_study(name: str) -> Study:
 
 def checked_study(values: dict[str, Any], origin: str) -> Study:
     """The study that a .toml's values describe. Raises ConfigError naming `origin` and the key."""
-    return checked(Study, extended(values, origin) if "extends" in values else values, origin)
+    return checked(Study, extend_study(values, origin) if "extends" in values else values, origin)
 
 
-def extended(values: dict[str, Any], origin: str) -> dict[str, Any]:
+def extend_study(values: dict[str, Any], origin: str) -> dict[str, Any]:
     """A study's values over those of the study of ours that it `extends`, which extends none.
 
     Its `variants` and `conditions` may be lists, of names of the other's.
@@ -216,44 +214,44 @@ def extended(values: dict[str, Any], origin: str) -> dict[str, Any]:
         if isinstance(names := values.get(key), list):
             of_other = other.get(key, {})
             if wrong := [name for name in names if name not in list(of_other)]:
-                known = ", ".join(of_other)
-                raise ConfigError(f"{origin}: {key}: {wrong[0]!r:.60} is none of {known}")
+                choices = ", ".join(of_other)
+                raise ConfigError(f"{origin}: {key}: {wrong[0]!r:.60} is none of {choices}")
             values[key] = {name: of_other[name] for name in names}
     return other | values
 
 
 def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run]:
-    """Every run, planned; scenes vary slowest and variants fastest, so that a study cut short has
-    compared something.
+    """Every run, planned; variants vary fastest, so that a study cut short has full comparisons.
 
-    Args: running, device: of `Planner`. A scene of a table that is not there has no run
-      (`lacking`).
+    Args: running, device: of `Planner`. A missing scene of a table has no run (`list_missing`).
     Raises: ConfigError, InputError.
-    Choices: all runs of a condition are measured under one protocol, since figures of two must not
-      meet in a mean.
+    Choices: all runs of a condition are measured under one protocol, since figures of two do not
+      average.
     """
     planner = Planner(running=running, device=device)
     runs: list[Run] = []
     before: dict[tuple[Any, ...], list[Plan]] = defaultdict(list)
     try:
         for named, seed, condition, variants in study.points():
-            for budget, spent in study.budgets.settings().items():
+            for budget, budget_settings in study.budgets.settings().items():
                 for variant in variants:
-                    values = merged(_values(study, condition, variant), {"train": spent})
+                    values = merged(_values(study, condition, variant), {"train": budget_settings})
                     scene, table = named, study.tables.get(condition)
                     if table is not None:
                         if table.lacks(named, is_semantic(values)):
                             continue
                         scene = table.folder(named)
-                        values = merged(values, table.taught(is_semantic(values)))
+                        values = merged(values, table.teacher_settings(is_semantic(values)))
                     earlier = before[seed, condition, budget, variant]
                     lessons = [
                         one.lesson
                         for one in earlier
                         if one.lesson is not None and one.lesson.lessons
                     ]
-                    own = {"start": "shipped"} | scene_values(scene)[1].get("knowledge", {})
-                    values = merged({"knowledge": own}, merged(values, seeded(scene, values, seed)))
+                    knowledge = {"start": "shipped"} | scene_values(scene)[1].get("knowledge", {})
+                    values = merged(
+                        {"knowledge": knowledge}, merged(values, seed_settings(scene, values, seed))
+                    )
                     place = suffix(f"study-{variant}-seed{seed}-") if study.grows else ""
                     plan = planner.plan(scene, values=values, place=place, lessons=lessons)
                     title = named if table else plan.title.removeprefix(place)
@@ -262,15 +260,16 @@ def expand(study: Study, running: bool = False, device: str = "cpu") -> list[Run
     finally:
         planner.save()
     for condition in study.conditions:
-        used = sorted({run.protocol for run in runs if run.condition == condition})
-        if len(used) > 1:
+        protocols = sorted({run.protocol for run in runs if run.condition == condition})
+        if len(protocols) > 1:
             raise ConfigError(
-                f"scenes measured as {' and as '.join(used)} do not compare; set ingest.protocol"
+                f"scenes measured as {' and as '.join(protocols)} do not compare; "
+                "set ingest.protocol"
             )
     return runs
 
 
-def lacking(study: Study, condition: str, variant: str) -> dict[str, list[str]]:
+def list_missing(study: Study, condition: str, variant: str) -> dict[str, list[str]]:
     """Scenes of a table that a variant cannot run on, by why it cannot."""
     table, reasons = study.tables[condition], defaultdict(list)
     semantic = is_semantic(_values(study, condition, variant))
@@ -280,7 +279,7 @@ def lacking(study: Study, condition: str, variant: str) -> dict[str, list[str]]:
 
 
 def is_semantic(values: Sections) -> bool:
-    """Whether settings ask for features, so that a teacher is needed."""
+    """True where settings ask for features, so that a teacher is needed."""
     return bool(values.get("train", {}).get("semantics", True))
 
 
@@ -292,10 +291,8 @@ def _values(study: Study, condition: str, variant: str) -> Sections:
     return merged(merged(values, read_toml("ablations", ablation) if ablation else {}), own)
 
 
-def seeded(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
-    """A seed's settings: training's, and the noise of pseudo labels. A teacher that draws nothing
-    is computed once.
-    """
+def seed_settings(scene: str, values: dict[str, Any], seed: int) -> dict[str, Any]:
+    """A seed's settings: of training, and of a label teacher's noise; other teachers run once."""
     kind = merged(scene_values(scene)[1], values).get("teacher", {}).get("kind")
     return {"train": {"seed": seed}} | ({"teacher": {"seed": seed}} if kind == "labels" else {})
 
@@ -329,21 +326,21 @@ def execute(
         parts.setdefault(title, []).append(run)
     links = {run.name: run.plan.targets[LAST] for run in runs}
     at_once = f"{cores // threads} at once, {threads} threads each"
-    with reported(runs, say, refresh):
+    with report_progress(runs, say, refresh):
         for title, part in parts.items():
             if waiting := outstanding(part):
                 try:
                     say(f"  {title}: {describe(waiting)}; {at_once}")
                     ended = snakemake(waiting, cores, threads, device, on)
                     outcome = Outcome(max(outcome.code, ended.code), outcome.failed | ended.failed)
-                finally:  # a study that is stopped names what it has finished
+                finally:  # a stopped study links its finished runs
                     store.link(f"study-{name}", links)
     store.link(f"study-{name}", links)
     return outcome
 
 
 def describe(steps: list[Step]) -> str:
-    """How many steps of each stage are to run."""
+    """The number of steps to run of each stage."""
     counts: dict[str, int] = {}
     for step in steps:
         counts[step.stage] = counts.get(step.stage, 0) + 1
@@ -355,12 +352,10 @@ def describe(steps: list[Step]) -> str:
 
 
 @contextmanager
-def reported(
+def report_progress(
     runs: Sequence[Run], say: Callable[[str], None], refresh: Callable[[], object] = lambda: None
 ) -> Iterator[None]:
-    """Say `n of m done` of every run that is finished while the block runs, and `refresh` what
-    shows them now and then.
-    """
+    """Report `n of m done` as runs finish during the block, and call `refresh` now and then."""
     waiting = {run.name: run.steps[-1] for run in runs if not run.steps[-1].fresh}
     over = threading.Event()
 

@@ -1,6 +1,4 @@
-"""Tables of a study's page: means and differences by variant, each scene, what is missing, what was
-left out.
-"""
+"""Tables of a study's page: means and differences by variant, each scene, missing and left out."""
 
 from __future__ import annotations
 
@@ -50,16 +48,16 @@ def mean_text(summary: Summary, figure: Figure) -> str:
 def difference_text(difference: Difference, figure: Figure) -> str:
     """`+2.1 [1.0, 3.2]`, or `×0.48 [0.40, 0.55]`; no interval where there is one unit."""
 
-    def shown(value: float) -> str:
+    def format_value(value: float) -> str:
         return f"{value:.2f}" if figure.ratio else number(value, figure)
 
     interval = (
         ""
         if math.isnan(difference.low)
-        else (f" [{shown(difference.low)}, {shown(difference.high)}]")
+        else (f" [{format_value(difference.low)}, {format_value(difference.high)}]")
     )
     sign = "×" if figure.ratio else "+" if difference.mean >= 0 else ""
-    return sign + shown(difference.mean) + interval
+    return sign + format_value(difference.mean) + interval
 
 
 def shown_figures(lines: list[Line]) -> list[Figure]:
@@ -68,9 +66,7 @@ def shown_figures(lines: list[Line]) -> list[Figure]:
 
 
 def labels(lines: list[Line]) -> list[str]:
-    """What tells lines apart; a study of one condition or of the scenes' own budget does not name
-    it.
-    """
+    """Columns that identify a line; a single condition or the scenes' own budget is not one."""
     return [
         name
         for name in ("condition", "budget", "variant")
@@ -79,9 +75,7 @@ def labels(lines: list[Line]) -> list[str]:
 
 
 def table_row(line: Line, lines: list[Line]) -> list[tuple[str, str, bool]]:
-    """Cells of one of `lines` as (mean ± spread, paired difference, whether its interval excludes
-    no effect).
-    """
+    """Cells of one of `lines`: (mean ± spread, paired difference, interval excludes no effect)."""
     texts = [*(getattr(line, name) for name in labels(lines)), f"{line.n_done} of {line.n_runs}"]
     cells = [(text, "", False) for text in texts]
     for figure in shown_figures(lines):
@@ -93,8 +87,7 @@ def table_row(line: Line, lines: list[Line]) -> list[tuple[str, str, bool]]:
 
 
 def tables(lines: list[Line], baseline: str) -> list[tuple[list[str], list[tuple[bool, list]]]]:
-    """(header, rows) of the comparison, in two tables that fit a screen: how good it is, and what
-    it costs.
+    """(header, rows) of the comparison, in two tables that fit a screen: quality, and cost.
 
     A row: whether it is the baseline's, and its cells as of `table_row`.
     """
@@ -116,19 +109,19 @@ def tables(lines: list[Line], baseline: str) -> list[tuple[list[str], list[tuple
 
 def scene_table(rows: list[Row]) -> list[list[str]]:
     """Header and rows: each scene apart, mean ± spread over seeds."""
-    done = [row for row in rows if row["state"] == "done"]
+    finished = [row for row in rows if row["state"] == "done"]
     figures = [
         figure
         for figure in FIGURES
-        if figure.key in BY_SCENE and any(row[figure.key] is not None for row in done)
+        if figure.key in BY_SCENE and any(row[figure.key] is not None for row in finished)
     ]
     names = [
         name
         for name in ("scene", "condition", "budget", "variant")
-        if any(row[name] for row in done)
+        if any(row[name] for row in finished)
     ]
     table = [[*names, *(figure.heading for figure in figures)]]
-    for where, members in sorted(groups(done, *names).items(), key=lambda item: item[0][0]):
+    for where, members in sorted(groups(finished, *names).items(), key=lambda item: item[0][0]):
         cells = list(where)
         for figure in figures:
             values = [row[figure.key] for row in members if row[figure.key] is not None]
@@ -149,10 +142,10 @@ def missing(rows: list[Row]) -> list[tuple[str, str]]:
 
 def left_out(rows: list[Row]) -> list[tuple[str, str, str]]:
     """(what, why, by which variants) of all that finished runs left out."""
-    done = [row for row in rows if row["state"] == "done"]
-    every = list(dict.fromkeys(row["variant"] for row in done))
+    finished = [row for row in rows if row["state"] == "done"]
+    every = list(dict.fromkeys(row["variant"] for row in finished))
     variants: dict[tuple[str, str], dict[str, None]] = {}
-    for row in done:
+    for row in finished:
         for entry in row["left_out"].items():
             variants.setdefault(entry, {})[row["variant"]] = None
     return sorted(
@@ -163,9 +156,7 @@ def left_out(rows: list[Row]) -> list[tuple[str, str, str]]:
 
 @dataclass(frozen=True)
 class Reach:
-    """Where a curve gets to a value: at `x`, before (`≤`) its first point, or not (`>`) up to its
-    last.
-    """
+    """The place where a curve reaches a value: `x`, `≤` its first point, or `>` its last."""
 
     x: float
     bound: str = ""
@@ -175,7 +166,7 @@ class Reach:
 
 
 def reach(points: Sequence[tuple[float, float]], target: float) -> Reach:
-    """Where the line through (x, y), in order of x, first gets to `target`."""
+    """The x at which the line through (x, y), in order of x, first reaches `target`."""
     points = sorted(points)
     if points[0][1] >= target:
         return Reach(points[0][0], "≤" if len(points) > 1 else "")
@@ -189,9 +180,9 @@ def sections(study: Study, rows: list[Row]) -> list[Section]:
     """One section; none without two budgets, or before a scene has the baseline's last one."""
     budgets = list(study.budgets.settings())
     timed = [row for row in on_one_machine(rows)[0] if row["train_seconds"] is not None]
-    done = [row for row in timed if row["state"] == "done"]
+    finished = [row for row in timed if row["state"] == "done"]
     table = []
-    for (condition, scene), some in groups(done, "condition", "scene").items():
+    for (condition, scene), some in groups(finished, "condition", "scene").items():
         by = {name: groups(of, "budget") for (name,), of in groups(some, "variant").items()}
         end = by.get(study.baseline, {}).get((budgets[-1],))
         if end is None:
@@ -199,7 +190,7 @@ def sections(study: Study, rows: list[Row]) -> list[Section]:
         for name in (name for name in by if name != study.baseline):
             cells = [*([condition] if condition else []), scene, name]
             for figure in SHOWN:
-                cells += reached(end, list(by[name].values()), figure)
+                cells += reach_cells(end, list(by[name].values()), figure)
             table.append(cells)
     if len(budgets) < 2 or not table:
         return []
@@ -212,17 +203,14 @@ def sections(study: Study, rows: list[Row]) -> list[Section]:
         ]
     note = (
         f"Where the line through the budgets' means first reaches what {study.baseline} ends with "
-        f"({budgets[-1]}), in "
-        "seconds of training and as a share of its seconds; '≤': with the smallest budget already. "
-        "Means over seeds."
+        f"({budgets[-1]}), in seconds of training and as a share of its seconds; '≤': with the "
+        "smallest budget already. Means over seeds."
     )
     return [Section(f"Seconds to what {study.baseline} ends with", note, [header, *table])]
 
 
-def reached(end: list[Row], budgets: list[list[Row]], figure: Figure) -> list[str]:
-    """A figure of the baseline's last runs, their seconds, and the seconds and share in which
-    others get there.
-    """
+def reach_cells(end: list[Row], budgets: list[list[Row]], figure: Figure) -> list[str]:
+    """A figure of the baseline's last budget, its seconds, and a variant's seconds to reach it."""
     if any(row[figure.key] is None for some in (end, *budgets) for row in some):
         return ["-", "-", "-"]
 
@@ -230,11 +218,11 @@ def reached(end: list[Row], budgets: list[list[Row]], figure: Figure) -> list[st
         return float(np.mean([row[key] for row in some]))
 
     target, whole = mean(end, figure.key), mean(end, "train_seconds")
-    found = reach(
+    crossing = reach(
         [(mean(some, "train_seconds"), mean(some, figure.key)) for some in budgets], target
     )
     return [
         number(target, figure),
         f"{whole:.0f}",
-        f"{found.bound}{found.x:.0f} ({found.share(whole)})",
+        f"{crossing.bound}{crossing.x:.0f} ({crossing.share(whole)})",
     ]

@@ -1,1 +1,1 @@
-"""The work folder: what is stored, linked, leased and listed there."""
+"""The work folder: store, links, leases and lists."""

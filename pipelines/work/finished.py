@@ -1,6 +1,4 @@
-"""Finished scenes by what a user calls them: a name, the folder of photos, a folder of links in
-work, an artifact.
-"""
+"""Finished scenes by a user's name for them: scene, photos' folder, links, artifact."""
 
 from __future__ import annotations
 
@@ -13,19 +11,17 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.names import suggest
 from chebsplat.formats.splats import is_splat
 from chebsplat.pipelines.work import folders, store
-from chebsplat.pipelines.work.scenes import is_source, names, shown
+from chebsplat.pipelines.work.scenes import escape_text, is_source, names
 from chebsplat.stages.registry import STAGES
 
 
 def is_artifact(path: Path) -> bool:
-    """Whether a folder is an artifact: it has a manifest."""
+    """True where a folder holds a manifest."""
     return os.path.isfile(path / "artifact.json")
 
 
 def links(folder: Path) -> dict[str, Path]:
-    """Artifacts that a folder names, stages in their order; whatever else lies there is none of
-    ours.
-    """
+    """Artifacts that a folder links to, in order of stages; its other entries are ignored."""
     try:
         stages = [entry.name for entry in os.scandir(folder) if is_artifact(Path(entry.path))]
     except OSError:
@@ -36,9 +32,7 @@ def links(folder: Path) -> dict[str, Path]:
 
 
 def titles() -> list[str]:
-    """Names of the folders of links in work: of scenes, with their settings, of sequences and
-    studies.
-    """
+    """Names of the folders of links in work: of scenes with their settings, sequences, studies."""
     base = store.work()
     there = sorted(os.listdir(base)) if os.path.isdir(base) else []
     return [
@@ -69,9 +63,9 @@ def scene_folder(scene: str) -> Path:
         return store.work() / (name if name in runs else runs[0])
     if runs:
         raise ConfigError(
-            f"{shown(scene)} was run with different settings: name one of {', '.join(runs)}"
+            f"{escape_text(scene)} was run with different settings: name one of {', '.join(runs)}"
         )
-    raise unknown(scene)
+    raise unknown_scene(scene)
 
 
 def holder(artifact: Path) -> Path | None:
@@ -89,36 +83,35 @@ def holder(artifact: Path) -> Path | None:
     return None
 
 
-def unknown(scene: str) -> ConfigError | InputError:
+def unknown_scene(scene: str) -> ConfigError | InputError:
     """The error for a scene that is not there, with the nearest names."""
     where, run = (
         f"no finished scene in {store.work()}",
-        (f"run it first: make scene={quote(shown(scene))}"),
+        (f"run it first: make scene={quote(escape_text(scene))}"),
     )
     if is_splat(path := os.path.expanduser(scene)) and os.path.exists(path):
         return InputError(
-            f"{shown(scene)} is a splat and {where}; make one of it: chebsplat lift "
-            f"{quote(shown(scene))} --out ..."
+            f"{escape_text(scene)} is a splat and {where}; make one of it: chebsplat lift "
+            f"{quote(escape_text(scene))} --out ..."
         )
     if is_source(os.path.expanduser(scene)):
-        return InputError(f"{shown(scene)} is {where}, nor the folder of one; {run}")
+        return InputError(f"{escape_text(scene)} is {where}, nor the folder of one; {run}")
     if "/" in scene:
         return InputError(
-            f"{shown(scene)} is missing: neither a scene, its folder nor an "
+            f"{escape_text(scene)} is missing: neither a scene, its folder nor an "
             "artifact; correct the path"
         )
-    known = titles()
-    near = suggest(scene, known) or known[:8]
+    existing = titles()
+    near = suggest(scene, existing) or existing[:8]
     if near and scene not in names("scenes"):
         return ConfigError(
-            f"{shown(scene)} is {where}, and no folder of one; there is {', '.join(near)}"
+            f"{escape_text(scene)} is {where}, and no folder of one; there is {', '.join(near)}"
         )
-    return ConfigError(f"{shown(scene)} is {where}, and no folder of one; {run}")
+    return ConfigError(f"{escape_text(scene)} is {where}, and no folder of one; {run}")
 
 
 def artifact_of(scene: str, stage: str) -> Path:
-    """A scene's artifact of a stage; an artifact is taken as it is, and its reader says if it is of
-    another kind.
+    """A scene's artifact of a stage; a path of an artifact is returned unchecked.
 
     Raises: as `scene_folder`; ConfigError if the scene has no such artifact.
     """
@@ -126,15 +119,13 @@ def artifact_of(scene: str, stage: str) -> Path:
         return path
     folder = scene_folder(scene)
     if not is_artifact(folder / stage):
-        run = f"run it to its end: make scene={quote(shown(folder.name.partition('@')[0]))}"
+        run = f"run it to its end: make scene={quote(escape_text(folder.name.partition('@')[0]))}"
         raise ConfigError(f"{folder} has no {stage}: it is not finished, or leaves that out; {run}")
     return folder / stage
 
 
 def teacher_of(scene: str) -> Path | None:
-    """A scene's `features` artifact; None without semantics, and for an artifact of no scene in
-    `work`.
-    """
+    """A scene's `features` artifact; None without semantics, or outside a scene in `work`."""
     with suppress(ConfigError, InputError):
         path = scene_folder(scene) / "teacher"
         return path if is_artifact(path) else None

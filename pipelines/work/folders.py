@@ -1,7 +1,7 @@
-"""Names of the user's folders: readable, the same for one folder always, and never another's.
+"""Names of the user's folders: readable, unique, and the same for a folder every time.
 
-A name ends with four digits of a digest of where its folder lies. `work/.folders/NAME` is a link to
-the folder that has run under a name: of two with one digest, the other is refused.
+A name ends with four digits of a digest of the folder's path. `work/.folders/NAME` links to the
+folder that has run under a name: a second folder with the same name is refused.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def name_of(folder: Path) -> str:
     """A folder's name. Raises ConfigError if another one has run under it."""
     digits = hashlib.sha256(os.fsencode(folder)).hexdigest()[:4]
     short = folder_name(folder).encode()[: LONGEST - len("folder--1a2b")].decode(errors="ignore")
-    ours = short.startswith("study-")  # so begin links of studies
+    ours = short.startswith("study-")  # the prefix of studies' links
     name = f"folder-{short}-{digits}" if ours else f"{short}-{digits}"
     if (other := owner(name)) not in (None, str(folder)):
         raise ConfigError(

@@ -1,8 +1,8 @@
-"""Sets of lessons that scenes have taught, and which of them a scene is pinned to.
+"""Sets of lessons from earlier scenes, and the lessons that a scene is pinned to.
 
 A set is a folder of the work folder, `.heads/NAME`, with a copy of every lesson under its key, and
-beside it what it is of. A lesson is added by a rename, so that any number of processes add at once,
-in any order, to the same set; none is ever changed.
+beside it a record of its photos, encoder and scene. A lesson is added by a rename, so that any
+number of processes add at once, in any order, to the same set; none is ever changed.
 """
 
 from __future__ import annotations
@@ -27,14 +27,12 @@ RECORD = ("capture", "start", "scene", "date")
 
 
 def now() -> str:
-    """The time in UTC, by which lessons of the same photos are told apart."""
+    """The time in UTC, by which lessons of the same photos are ordered."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def folder(name: str) -> Path:
-    """Where the set of this name lies, or will. Raises ConfigError on a name that leads
-    elsewhere.
-    """
+    """Path of the set of this name. Raises ConfigError on a name that leads elsewhere."""
     if not store.is_name(name):
         raise ConfigError(
             f"{name!r} cannot name a set of lessons: no / in it, and no . at its beginning"
@@ -43,24 +41,22 @@ def folder(name: str) -> Path:
 
 
 def members(name: str) -> dict[str, dict[str, Any]]:
-    """By key what each lesson of a set is of: the photos' identity (`capture`), the encoder's key
-    (`start`), the scene, and when it was added. Raises InputError naming a record that is damaged.
+    """Records of a set's lessons by key: identity of the photos (`capture`), key of the encoder
+    (`start`), scene, date. Raises InputError naming a damaged record.
     """
-    found = {}
+    records = {}
     for path in sorted(folder(name).glob("[!.]*.json")):
         place = path.with_suffix("")
         record = _record(place)
         if store.is_fresh(place) and FORGOTTEN not in record:
             if not set(RECORD) <= set(record):
                 raise InputError(f"{path} is no record of a lesson; {REMEDY}")
-            found[path.stem] = record
-    return found
+            records[path.stem] = record
+    return records
 
 
 def _record(place: Path) -> dict[str, Any]:
-    """What lies beside a lesson; empty where nothing does. Raises InputError where that is
-    damaged.
-    """
+    """The record beside a lesson; empty without one. Raises InputError where it is damaged."""
     path = place.with_suffix(".json")
     record = parse_json(path, REMEDY) if path.is_file() else {}
     if not isinstance(record, dict):
@@ -68,42 +64,38 @@ def _record(place: Path) -> dict[str, Any]:
     return record
 
 
-def add(name: str, made: Path, capture: str, start: str, scene: str) -> None:
-    """Put a finished lesson into a set, unless it teaches nothing, or is there.
+def add(name: str, path: Path, capture: str, start: str, scene: str) -> None:
+    """Copy a finished lesson into a set, unless it has no sums, is there, or was forgotten.
 
-    Args: made: the artifact, whose folder bears its key; capture: identity of the photos; start:
+    Args: path: the artifact, whose folder bears its key; capture: identity of the photos; start:
       key of the encoder.
     """
-    place = folder(name) / made.name
-    if store.is_fresh(place) or "none" in lesson.read_notes(made) or FORGOTTEN in _record(place):
+    place = folder(name) / path.name
+    if store.is_fresh(place) or "none" in lesson.read_notes(path) or FORGOTTEN in _record(place):
         return
     place.parent.mkdir(parents=True, exist_ok=True)
     values = (capture, start, scene, now())
     atomic_write(place.with_suffix(".json"), json.dumps(dict(zip(RECORD, values, strict=True))))
-    artifact.copy(made, place, artifact.verify(made, lesson.SCHEMA))
+    artifact.copy(path, place, artifact.verify(path, lesson.SCHEMA))
 
 
 def forget(name: str, key: str) -> None:
-    """Take a lesson out of a set. Raises ConfigError with the nearest keys where it is not
-    there.
-    """
-    held = members(name)
-    if key not in held:
-        near = suggest(key, held, 1)
+    """Take a lesson out of a set. Raises ConfigError with the nearest key where it is unknown."""
+    lessons = members(name)
+    if key not in lessons:
+        near = suggest(key, lessons, 1)
         raise ConfigError(
             f"{name} has no lesson {key}" + (f"; did you mean {near[0]}?" if near else "")
         )
     place = folder(name) / key
-    # no run of the scene adds it again
+    # so that no run of the scene adds it again
     atomic_write(place.with_suffix(".json"), json.dumps({FORGOTTEN: True}))
     (place / "artifact.json").unlink()
     shutil.rmtree(place)
 
 
 def usable(name: str, start: str, capture: str, scene: str) -> list[str]:
-    """Keys of the lessons of a set for an encoder, of other scenes and photos; of the same photos
-    the latest.
-    """
+    """Keys of a set's lessons for an encoder, of other scenes; the latest of the same photos."""
     latest: dict[str, tuple[str, str]] = {}
     for key, record in members(name).items():
         if record["start"] == start and record["capture"] != capture and record["scene"] != scene:
@@ -116,12 +108,10 @@ def usable(name: str, start: str, capture: str, scene: str) -> list[str]:
 def pinned(
     title: str, name: str, start: str, capture: str, scene: str, *, running: bool, newer: bool
 ) -> list[str]:
-    """Keys of the lessons that a scene starts from: those that `work/TITLE/pin.json` names for this
-    set, encoder and photos; what stands now where it names none, or newer ones are asked for. A run
-    writes them down.
+    """Keys of the lessons that a scene starts from: those in `work/TITLE/pin.json` for this set,
+    encoder and photos, else the usable ones now, or with `newer`; a run writes them down.
 
-    Args: capture: identity of the photos; scene: whose lessons are left out, too, as those of the
-      photos are.
+    Args: capture: identity of the photos, scene: whose own lessons are left out.
     Raises: InputError naming a pin that is damaged.
     """
     path, pins = store.work() / title / PIN, dict[str, list[str]]()
@@ -139,8 +129,8 @@ def pinned(
     return pins[of]
 
 
-def taken(title: str, name: str, key: str, running: bool) -> Path:
-    """The place in the store of a pinned lesson, copied there from the set if it is to run.
+def fetch(title: str, name: str, key: str, running: bool) -> Path:
+    """Path in the store of a pinned lesson, copied there from the set if it is to run.
 
     Args: title: of the scene that is pinned; name: of the set.
     Raises: ConfigError where the lesson is nowhere any more.
@@ -153,4 +143,4 @@ def taken(title: str, name: str, key: str, running: bool) -> Path:
             f"{title} is pinned to the lesson {key}, which {name} has no more; add "
             "newer=1 (--newer)"
         )
-    return store.taken_in(folder(name) / key, "learn", lesson.SCHEMA, running)
+    return store.import_artifact(folder(name) / key, "learn", lesson.SCHEMA, running)

@@ -1,4 +1,4 @@
-"""What lies in work, by scene: what was done, how much it takes, and what only one scene names."""
+"""An inventory of work by scene: stages, bytes, and artifacts that only one scene refers to."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ COLUMNS = ("scene", "source", "done", "MB", "alone", "when", "PSNR", "mIoU")
 
 
 def scenes() -> list[tuple[str, ...]]:
-    """A row of COLUMNS for each folder of links in work, of a scene or a study, as far as it can be
-    read: MB of what it names and of all that this was made of, and of what nothing else was made
-      of;
-    when the newest of what it names was finished. What is damaged counts nothing.
+    """A row of COLUMNS for each scene or study in work: MB of its artifacts and their inputs, of
+    those that no other needs, and the date of the newest. Damaged artifacts count 0.
     """
     store_paths = store.work().glob("store/*/*")
-    held = {path.name: _manifest(path) for path in store_paths if not path.name.startswith(".")}
-    reached = {title: _made_of(title, held) for title in titles()}
+    manifests = {
+        path.name: _manifest(path) for path in store_paths if not path.name.startswith(".")
+    }
+    reached = {title: _made_of(title, manifests) for title in titles()}
     sizes, times = (
-        {key: _size(manifest) for key, manifest in held.items()},
+        {key: _size(manifest) for key, manifest in manifests.items()},
         Counter(chain(*reached.values())),
     )
     rows: list[tuple[str, ...]] = []
     for title, keys in reached.items():
-        named = links(store.work() / title)
-        newest = max((path / "artifact.json").stat().st_mtime for path in named.values())
+        linked = links(store.work() / title)
+        newest = max((path / "artifact.json").stat().st_mtime for path in linked.values())
         when = time.strftime("%Y-%m-%d %H:%M", time.localtime(newest))
-        stages = [stage for stage in named if stage in STAGES]
-        done = "all" if "report" in named else " ".join(stages) or f"{len(named)} artifacts"
+        stages = [stage for stage in linked if stage in STAGES]
+        finished = "all" if "report" in linked else " ".join(stages) or f"{len(linked)} artifacts"
         source = (
-            _source(title, _manifest(named["ingest"]) if "ingest" in named else None)
+            _source(title, _manifest(linked["ingest"]) if "ingest" in linked else None)
             if stages
             else ""
         )
         psnr, miou, _ = summary.quality(
-            summary.figures(named["evaluate"]) if "evaluate" in named else None
+            summary.figures(linked["evaluate"]) if "evaluate" in linked else None
         )
         size = sum(sizes[key] for key in keys)
         alone = sum(sizes[key] for key in keys if times[key] == 1)
         rows.append(
-            (title, source, done, f"{size / 1e6:.1f}", f"{alone / 1e6:.1f}", when, psnr, miou)
+            (title, source, finished, f"{size / 1e6:.1f}", f"{alone / 1e6:.1f}", when, psnr, miou)
         )
     return rows
 
@@ -69,9 +69,7 @@ def _size(manifest: Manifest | None) -> int:
 
 
 def _source(title: str, ingest: Manifest | None) -> str:
-    """Where a scene comes from: the folder that its name stands for, or what its capture was made
-    of.
-    """
+    """A scene's source: the folder behind its name, or its capture's path or preset."""
     try:
         if folder := folders.owner(title.partition("@")[0]):
             return folder
@@ -82,9 +80,7 @@ def _source(title: str, ingest: Manifest | None) -> str:
 
 
 def in_work(scene: str) -> Path:
-    """A scene's folder of links. Raises InputError if it lies elsewhere: nothing is removed there;
-    ConfigError if an artifact is named.
-    """
+    """A scene's folder of links. Raises InputError outside work, ConfigError on an artifact."""
     folder = scene_folder(scene)
     if is_artifact(Path(os.path.expanduser(scene))):
         raise ConfigError(f"{scene} is an artifact; whole scenes are removed: name {folder.name}")
@@ -93,18 +89,22 @@ def in_work(scene: str) -> Path:
     return store.work() / folder.name
 
 
-def only_of(chosen: list[Path]) -> list[tuple[Path, int]]:
+def list_exclusive(scene_folders: list[Path]) -> list[tuple[Path, int]]:
     """Artifacts, with bytes, that nothing would name without the links in `chosen`."""
-    before = {path for path, _ in store.unnamed()}
-    return [(path, size) for path, size in store.unnamed(set(chosen)) if path not in before]
+    before = {path for path, _ in store.list_unreferenced()}
+    return [
+        (path, size)
+        for path, size in store.list_unreferenced(set(scene_folders))
+        if path not in before
+    ]
 
 
-def untouched(age: float) -> list[Path]:
+def list_idle(age: float) -> list[Path]:
     """Folders of scenes and studies whose artifacts are all older than so many seconds."""
-    found = {title: links(store.work() / title) for title in titles()}
+    link_paths = {title: links(store.work() / title) for title in titles()}
     ours = {
         title: paths
-        for title, paths in found.items()
+        for title, paths in link_paths.items()
         if set(paths) & set(STAGES) or title.startswith("study-")
     }
     return [
@@ -116,20 +116,20 @@ def untouched(age: float) -> list[Path]:
 
 def _made_of(title: str, manifests: dict[str, Manifest | None]) -> set[str]:
     """Keys of the artifacts in the store that a folder's links lead to, directly and as inputs."""
-    found: set[str] = set()
+    keys: set[str] = set()
     waiting = [Path(os.path.realpath(link)).name for link in links(store.work() / title).values()]
     while waiting:
         key = waiting.pop()
-        if key in found or key not in manifests:
+        if key in keys or key not in manifests:
             continue
-        found.add(key)
+        keys.add(key)
         manifest = manifests[key]
         waiting += [entry["key"] for entry in manifest.inputs.values()] if manifest else []
-    return found
+    return keys
 
 
 def others(folder: Path) -> list[str]:
-    """What lies in a scene's folder and is none of ours; it is never removed."""
+    """Entries of a scene's folder that are not ours, and are never removed."""
     return sorted(e.name for e in os.scandir(folder) if not e.is_symlink() and e.name != PAGE)
 
 

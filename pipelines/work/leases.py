@@ -1,12 +1,12 @@
-"""Leases: who is at work on what, told by a file that any shared file system keeps right.
+"""Leases: who works on what, recorded in files that work on any shared file system.
 
-A lease is filelock's: a file that only one process can make, which says who that is, is touched
-every few seconds, and goes when its holder is done. Whether a process of this machine lives is
-asked of the system; one elsewhere is dead when its file has not moved for long by the clock of who
-looks. No lock of the file system is needed.
+A lease is filelock's: a file that only one process can create, which names its holder, is touched
+every few seconds, and is removed when its holder is done. A holder on this machine is checked by
+its process; one elsewhere counts as dead when its file has not changed for EXPIRES seconds by the
+clock of the reader. File locks are not needed.
 
-Choices: whoever is silent for EXPIRES seconds and was alive all the same works on beside its
-  successor. Both publish the same artifact, whole; one is kept.
+Choices: a holder that was silent for EXPIRES seconds but alive works on beside its successor. Both
+  publish the same artifact, whole; one of them stays.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ from pathlib import Path
 
 from filelock import SoftFileLease, Timeout
 
-EVERY = 5.0  # seconds between signs of life
+EVERY = 5.0  # seconds between heartbeats
 EXPIRES = 60.0  # seconds of silence after which a holder elsewhere counts as dead
 
 
 @contextmanager
-def held(path: Path, wait: Callable[[str], object] = lambda _machine: None) -> Iterator[None]:
-    """Hold the lease `path` within, after whoever holds it; `wait` is told on which machine."""
+def hold(path: Path, wait: Callable[[str], object] = lambda _machine: None) -> Iterator[None]:
+    """Hold the lease `path` within the block; where it is taken, `wait` gets its machine's name."""
     lease, seconds = _lease(path), 0.0
     while True:
         try:
-            taken = lease.acquire(timeout=seconds)
+            acquired = lease.acquire(timeout=seconds)
             break
         except Timeout:
             if seconds == 0:
                 wait(_machine(lease) or "this machine")
-            elif lease.owner is None:  # whoever made it was killed before it could say who it is
+            elif lease.owner is None:  # its creator was killed before it wrote its name
                 lease.force_break()
             seconds = EXPIRES
-    with taken:
+    with acquired:
         yield
 
 
 def holder(path: Path) -> str | None:
-    """The machine of who seems to hold a lease; None: nobody, or a dead process of this machine."""
+    """The machine of a lease's likely holder; None: nobody, or a dead process of this machine."""
     lease = _lease(path)
     if machine := _machine(lease):
         try:
@@ -56,4 +56,4 @@ def _lease(path: Path) -> SoftFileLease:
 
 def _machine(lease: SoftFileLease) -> str | None:
     owner = lease.owner
-    return owner.hostname.partition("?")[0] if owner else None  # a container's number follows
+    return owner.hostname.partition("?")[0] if owner else None  # the id of a container follows

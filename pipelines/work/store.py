@@ -1,6 +1,4 @@
-"""The work folder: artifacts by key, links by scene, remembered hashes, and the collection of what
-nothing names.
-"""
+"""The work folder: artifacts by key, links by scene, cached hashes, and garbage collection."""
 
 from __future__ import annotations
 
@@ -24,12 +22,12 @@ from chebsplat.pipelines.work import leases
 
 
 def work() -> Path:
-    """Where everything lies: the folder CHEBSPLAT_WORK, otherwise `work` where the user stands."""
+    """Path of the work folder: CHEBSPLAT_WORK, otherwise `work` in the current folder."""
     return Path(os.environ.get("CHEBSPLAT_WORK") or "work").absolute()
 
 
 def make_work() -> None:
-    """Raises ConfigError where there cannot be such a folder."""
+    """Create the work folder. Raises ConfigError where that cannot be."""
     try:
         work().mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError, FileNotFoundError):
@@ -39,17 +37,17 @@ def make_work() -> None:
 
 
 def lease(base: Path, name: str) -> Path:
-    """The lease of a work folder on what is called so: an artifact's stage and key, a run."""
+    """Path of the lease in a work folder with a name: an artifact's stage and key, or a run."""
     return base / ".held" / name
 
 
 def run_lease(plans: Path) -> Path:
-    """The lease that a run holds as long as the folder of its plan is needed."""
+    """Path of the lease that a run holds while the folder of its plan is needed."""
     return lease(plans.parents[1], f"run-{plans.name}")
 
 
 def artifact_path(stage: str, key: str) -> Path:
-    """Where the artifact of a stage and key lies, or will."""
+    """Path of the artifact of a stage and key, finished or not."""
     return work() / "store" / stage / key
 
 
@@ -59,14 +57,12 @@ def say(text: str) -> None:
 
 
 def is_fresh(path: Path) -> bool:
-    """Finished, every member there in its size. Other damage is found by the stage that reads it,
-    or by `verify`.
-    """
+    """Finished, every file there with its size; `verify` and readers check digests."""
     return artifact.is_whole(path)
 
 
 def is_name(text: str) -> bool:
-    """Whether a text can be the name of something in a folder, and lead nowhere else."""
+    """True for a valid name of an entry in a folder, which cannot lead elsewhere."""
     return text != "" and not text.startswith(".") and not set(text) & set("/\0")
 
 
@@ -124,7 +120,7 @@ def link(scene: str, targets: dict[str, Path]) -> Path:
     return folder
 
 
-def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
+def list_unreferenced(without: Container[Path] = ()) -> list[tuple[Path, int]]:
     """Artifacts that no link and no running plan reaches, neither directly nor as an input, and
     leftovers of runs that failed or were killed; with bytes. Raises InputError if a manifest is
     damaged.
@@ -156,17 +152,15 @@ def unnamed(without: Container[Path] = ()) -> list[tuple[Path, int]]:
 
 
 def age(path: Path) -> float:
-    """Seconds since an artifact was finished, or a leftover was last changed, by the clock of the
-    file system.
-    """
-    done = path / "artifact.json"
-    changed = (done if done.is_file() else path).lstat().st_mtime
+    """Seconds since an artifact was finished, or a leftover changed, by the file system's clock."""
+    manifest = path / "artifact.json"
+    changed = (manifest if manifest.is_file() else path).lstat().st_mtime
     with tempfile.TemporaryFile(dir=work()) as clock:
         return os.fstat(clock.fileno()).st_mtime - changed
 
 
 def sweep() -> None:
-    """Remove leases of the dead, and where no run is under way what Snakemake remembers."""
+    """Remove leases of dead holders, and Snakemake's records where no run is under way."""
     for path in work().glob(".held/*"):
         with suppress(FileNotFoundError):
             if age(path) > leases.EXPIRES and holder(path) is None:
@@ -177,41 +171,37 @@ def sweep() -> None:
 
 
 def _real(path: Path) -> Path:
-    """Where a path leads; unlike `Path.resolve`, it takes links that lead in a circle for what they
-    are.
-    """
+    """Path with links resolved; unlike `Path.resolve`, circular links raise nothing."""
     return Path(os.path.realpath(path))
 
 
 def _running(base: Path) -> set[Path]:
     """Artifacts that a run under way makes or reads. Raises InputError if its plan is damaged."""
-    found: set[Path] = set()
+    paths: set[Path] = set()
     for plan in base.glob(".plans/*/plan.json"):
         try:
             if is_under_way(plan.parent):
                 for step in json.loads(plan.read_text())["steps"]:
-                    found |= {Path(step["path"]), *map(Path, step["inputs"].values())}
-        except FileNotFoundError:  # it has just ended
+                    paths |= {Path(step["path"]), *map(Path, step["inputs"].values())}
+        except FileNotFoundError:  # the run has just ended
             continue
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             advice = f"remove {plan.parent} if no run is under way"
             raise InputError(
                 f"{plan} is damaged: what that run needs is not known; {advice}"
             ) from None
-    return found
+    return paths
 
 
 def is_under_way(plans: Path) -> bool:
-    """Whether the run that a folder of `.plans` belongs to goes on, here or on another machine."""
+    """True while the run of a folder of `.plans` goes on, here or on another machine."""
     return _owner_lives(plans) or holder(run_lease(plans)) is not None
 
 
 def holder(path: Path) -> str | None:
-    """The machine of whoever holds a lease; None: nobody, or one elsewhere, silent by the file
-    system's clock.
-    """
+    """The machine that holds a lease; None: nobody, or one elsewhere that has expired."""
     machine = leases.holder(path)
-    with suppress(FileNotFoundError):  # it has just been let go
+    with suppress(FileNotFoundError):  # it has just been released
         if machine == socket.gethostname() or (machine and age(path) < leases.EXPIRES):
             return machine
     return None
@@ -221,7 +211,7 @@ def _in_use(path: Path, running: set[Path]) -> bool:
     """A hidden folder of a running process or of a run under way, or younger than an hour."""
     if not path.name.startswith("."):
         return False
-    # .tmp-<key>-<process>, of this machine or of one that a run has sent its jobs to
+    # .tmp-<key>-<process>, of this machine or of a node of a run's
     if path.name.startswith(".tmp-"):
         return _owner_lives(path) or path.with_name(path.name.split("-")[1]) in running
     if not path.name.startswith(".part-"):
@@ -233,21 +223,21 @@ def _in_use(path: Path, running: set[Path]) -> bool:
 
 
 def remove_half(path: Path) -> None:
-    """Remove what killed processes have left of an artifact; its lease must be held."""
+    """Remove the partial artifacts of killed processes; the artifact's lease must be held."""
     for half in path.parent.glob(f".tmp-{path.name}-*"):
         if not _owner_lives(half):
             shutil.rmtree(half, ignore_errors=True)
 
 
 def remove_halves(paths: Iterable[Path]) -> None:
-    """Remove what killed jobs have left of artifacts, but for those that another run makes."""
+    """Remove partial artifacts of killed jobs, but for those that another run makes."""
     for path in paths:
         if holder(lease(path.parents[2], f"{path.parent.name}-{path.name}")) is None:
             remove_half(path)
 
 
 def _owner_lives(path: Path) -> bool:
-    """Whether the process of this machine whose number ends the folder's name still runs."""
+    """True while the process of this machine whose number ends the folder's name runs."""
     owner = path.name.rsplit("-", 1)[-1]
     if not owner.isdecimal():
         return False
@@ -261,7 +251,7 @@ def _owner_lives(path: Path) -> bool:
 
 
 def remove(path: Path) -> None:
-    """Remove what `unnamed` found; of a link, the link alone."""
+    """Remove a path that `list_unreferenced` listed; of a link, the link alone."""
     if path.is_symlink() or not path.is_dir():
         path.unlink(missing_ok=True)
         return
@@ -269,9 +259,8 @@ def remove(path: Path) -> None:
     shutil.rmtree(path, ignore_errors=True)
 
 
-def taken_in(folder: Path, stage: str, schema: str, running: bool) -> Path:
-    """The place in the store of a stage's artifact that lies elsewhere; to run, it is copied there,
-    and verified.
+def import_artifact(folder: Path, stage: str, schema: str, running: bool) -> Path:
+    """Path in the store of a stage's artifact from elsewhere; verified, and copied there to run.
 
     Raises: InputError on a damaged artifact, or one of another schema.
     """

@@ -1,4 +1,4 @@
-"""What a scene has come to, in a few lines: and what runs, waits and has failed, without torch."""
+"""Summaries of finished scenes and of runs under way, in a few lines, without torch."""
 
 from __future__ import annotations
 
@@ -23,9 +23,7 @@ LINES = 5  # of a failed step's log
 
 
 def figures(evaluation: Path) -> Any:
-    """What an evaluation measured; None where there is none, or it is damaged (`chebsplat verify`
-    says how).
-    """
+    """The figures of an evaluation; None where missing or damaged (see `chebsplat verify`)."""
     try:
         return read_document(evaluation, artifact.read_manifest(evaluation), "figures.json")
     except InputError:
@@ -52,20 +50,18 @@ def quality(figures: Any) -> tuple[str, str, str]:
 
 
 def table(evaluation: Path) -> list[tuple[str, str, str]]:
-    """(what, value, beside it) of a scene that was evaluated; what was not measured is not
-    there.
-    """
-    # with zarr, which a list of scenes does not wait for
+    """(name, value, remark) of each figure of an evaluated scene; unmeasured ones are absent."""
+    # imports zarr, which the list of scenes does not need
     from chebsplat.formats.evaluation import rests
 
     measured = figures(evaluation)
-    where = f", measured on {measured_on(artifact.read_manifest(evaluation))}" if measured else ""
+    machine = f", measured on {measured_on(artifact.read_manifest(evaluation))}" if measured else ""
     psnr, miou, teacher = quality(measured)
     size = {
         name: text("{:.1f} MB", scaled(number(measured, "bytes", name)))
         for name in ("ply", "spz", "ragged")
     }
-    others = ", ".join(f"{name} {shown}" for name, shown in size.items() if shown and name != "ply")
+    others = ", ".join(f"{name} {value}" for name, value in size.items() if value and name != "ply")
     segmentation = (measured or {}).get("segmentation") or {}
     beside = [rests(segmentation), f"its 2D teacher {teacher}" if teacher else ""]
     if segmentation and not miou:
@@ -78,44 +74,40 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
             as_taken(measured),
         ),
         ("mIoU", miou, "; ".join(filter(None, beside))),
-        *((what, str(len(names)), few(names)) for what, names in strangers(segmentation)),
+        *((what, str(len(names)), few(names)) for what, names in unmatched_names(segmentation)),
         ("Gaussians", text("{:,}", number(measured, "n_gaussians")), ""),
         ("PLY", size["ply"], others),
         (
             "frames/s",
             text("{:.0f}", number(measured, "frames_per_second", "color")),
-            f"colour alone{where}",
+            f"colour alone{machine}",
         ),
     ]
     return [row for row in rows if row[1]]
 
 
 def as_taken(figures: Any) -> str:
-    """SSIM and size of test photos as they were taken; empty where these are what was trained
-    on.
-    """
-    found = (figures or {}).get("image", {}).get("as_taken")
-    return "SSIM {:.3f}, {}×{} pixels".format(found["ssim"], *found["size"]) if found else ""
+    """SSIM and size of test photos at their original size; empty where that is the trained one."""
+    original = (figures or {}).get("image", {}).get("as_taken")
+    return (
+        "SSIM {:.3f}, {}×{} pixels".format(original["ssim"], *original["size"]) if original else ""
+    )
 
 
-def strangers(segmentation: Any) -> list[tuple[str, list[str]]]:
-    """Classes of the truth, and labels of the scene, that the other has no name for; nothing where
-    there are none.
-    """
+def unmatched_names(segmentation: Any) -> list[tuple[str, list[str]]]:
+    """Classes of the truth, and labels of the scene, without a counterpart in the other."""
     words = {"truth": "true classes without a label", "scene": "labels that are no class"}
-    found = segmentation.get("unmatched", {})
-    return [(what, found[side]) for side, what in words.items() if side in found]
+    unmatched = segmentation.get("unmatched", {})
+    return [(what, unmatched[side]) for side, what in words.items() if side in unmatched]
 
 
-def doubts(made: dict[str, Path]) -> list[str]:
-    """What is doubtful about the poses of a scene, or about its teacher, in sentences. made:
-    artifacts by stage.
-    """
-    said: list[str] = []
-    for stage in {"pose", "agree"} & made.keys():
-        facts = artifact.read_manifest(made[stage]).facts
-        said += facts.get("doubts") or filter(None, [facts.get("doubt")])
-    return said
+def doubts(artifacts: dict[str, Path]) -> list[str]:
+    """Sentences on doubtful poses or a doubtful teacher of a scene, from its artifacts by stage."""
+    sentences: list[str] = []
+    for stage in {"pose", "agree"} & artifacts.keys():
+        facts = artifact.read_manifest(artifacts[stage]).facts
+        sentences += facts.get("doubts") or filter(None, [facts.get("doubt")])
+    return sentences
 
 
 def scaled(size: float | None) -> float | None:
@@ -129,7 +121,7 @@ def readable(path: Path) -> str:
     return os.path.relpath(path, here) if path.is_relative_to(here) else str(path)
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+def align_columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """Rows as lines, every column as wide as its widest cell."""
     if not rows:
         return []
@@ -142,13 +134,13 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 
 def show_rows(rows: Sequence[Sequence[str]]) -> None:
     """Print rows in aligned columns."""
-    for line in aligned(rows):
+    for line in align_columns(rows):
         print(line)
 
 
 @dataclass(frozen=True)
 class State:
-    """A step of a run: what is the matter with it, in words, and its log where that says more."""
+    """A step of a run: its state, a remark, and the end of its log where it failed."""
 
     stage: str
     key: str
@@ -158,7 +150,7 @@ class State:
 
 
 def state_of(folder: Path, step: dict[str, Any]) -> State:
-    """How far a step is. folder: of the run's plan."""
+    """The state of a step. folder: of the run's plan."""
     stage, key, file = step["stage"], step["key"], folder / f"{step['stage']}-{step['key']}"
     if store.is_fresh(Path(step["path"])):
         return State(stage, key, DONE)
@@ -173,12 +165,12 @@ def state_of(folder: Path, step: dict[str, Any]) -> State:
 
 
 def seconds(file: Path) -> int:
-    """Since a file was written, which what it belongs to does as it begins."""
+    """Seconds since a file was written, which its step or run does as it begins."""
     return max(int(store.age(file)), 0)
 
 
 def last_lines(log: Path) -> tuple[str, ...]:
-    """The end of a log, and where it lies."""
+    """The end of a log, and its path."""
     try:
         lines = log.read_text(errors="replace").strip().splitlines()[-LINES:]
     except OSError:
@@ -187,12 +179,12 @@ def last_lines(log: Path) -> tuple[str, ...]:
 
 
 def runs() -> Iterator[tuple[str, list[State]]]:
-    """Every run that `work` knows of, in words, with the states of its steps."""
+    """Every run in `work` as a title, with the states of its steps."""
     for plan in sorted(store.work().glob(".plans/*/plan.json")):
         try:
             steps = json.loads(plan.read_text())["steps"]
             states = [state_of(plan.parent, step) for step in steps]
-        except FileNotFoundError:  # it has just ended
+        except FileNotFoundError:  # the run has just ended
             continue
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             yield f"{plan} is damaged; remove {plan.parent} if no run is under way", []
@@ -203,7 +195,7 @@ def runs() -> Iterator[tuple[str, list[State]]]:
 
 
 def lines() -> Iterator[str]:
-    """What there is to say of all runs."""
+    """The status of all runs, line by line."""
     for title, states in runs():
         count = Counter(state.what for state in states)
         yield f"{title}: " + ", ".join(

@@ -1,6 +1,4 @@
-"""Image figures of rendered views: PSNR, SSIM, LPIPS where its weights are given, and frames per
-second.
-"""
+"""Image figures of rendered views: PSNR, SSIM, LPIPS if there are weights; frames a second."""
 
 from __future__ import annotations
 
@@ -35,21 +33,20 @@ def image_figures(
     masks: list[np.ndarray] | None,
     lpips: Lpips | None = None,
 ) -> dict[str, Any]:
-    """PSNR, SSIM and LPIPS of 8-bit images, by view and in the mean; `lpips` is None where not
-    measured.
+    """PSNR, SSIM and LPIPS of 8-bit images, by view and in the mean; `lpips` None: not measured.
 
     Choices: masked pixels do not count; for SSIM and LPIPS they take the true colour. `psnr_fit` is
-      the PSNR after an affine fit of a render's colours to its photo: what exposure and white
-      balance of the test photos do not spoil.
+      the PSNR after an affine fit of a render's colours to its photo, independent of the photo's
+      exposure and white balance.
     """
     names = ("psnr", "psnr_fit", "ssim", *(["lpips"] if lpips else []))
     per_view: dict[str, list[float]] = {name: [] for name in names}
     for k, (render, true) in enumerate(zip(renders, truth, strict=True)):
         counted = np.ones(true.shape[:2], bool) if masks is None else masks[k]
         filled = np.where(counted[..., None], render, true)
-        pixels, wanted = render[counted], true[counted]
-        per_view["psnr"].append(min(psnr(pixels, wanted), 100.0))
-        per_view["psnr_fit"].append(min(psnr(color_fitted(pixels, wanted), wanted), 100.0))
+        pixels, target = render[counted], true[counted]
+        per_view["psnr"].append(min(psnr(pixels, target), 100.0))
+        per_view["psnr_fit"].append(min(psnr(color_fitted(pixels, target), target), 100.0))
         per_view["ssim"].append(ssim(filled, true))
         if lpips is not None:
             per_view["lpips"].append(lpips.distance(filled, true))
@@ -64,9 +61,9 @@ def figures_as_taken(
     `size`, width and height of most of them; None where none was undistorted or reduced.
 
     Args:    cameras: of the capture's views, by name.
-    Choices: the scene is rendered as fine as the photo is, and interpolated, by cubic splines,
-      where its pixels lie. What a photo has beyond its undistorted view, or is masked there, does
-      not count; for SSIM it is as in the photo.
+    Choices: the scene is rendered at the photo's resolution, and interpolated, by cubic splines, at
+      the photo's pixels. Pixels outside the undistorted view, or masked in it, do not count; for
+      SSIM they take the photo's colour.
     """
     if capture.taken is None:
         return None
@@ -93,12 +90,12 @@ def figures_as_taken(
             row, column = ((places[:, inside] + 0.5) / finer).astype(int)
             inside[inside] = mask[row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)]
         channels = np.moveaxis(render.astype(np.float32), -1, 0)
-        shown = np.stack(
+        colors = np.stack(
             [map_coordinates(c, places[:, inside], np.float32, mode="nearest") for c in channels],
             -1,
         )
         filled = truth.copy().reshape(-1, 3)
-        filled[inside] = shown.round().clip(0, 255)
+        filled[inside] = colors.round().clip(0, 255)
         per_view["psnr"].append(min(psnr(filled[inside], truth.reshape(-1, 3)[inside]), 100.0))
         per_view["ssim"].append(ssim(filled.reshape(truth.shape), truth))
         sizes.append((width, height))
@@ -114,10 +111,8 @@ def enlarged(view: View, factor: float) -> View:
     return View(K, view.viewmat, math.ceil(view.width * factor), math.ceil(view.height * factor))
 
 
-def perceptual(path: Path) -> Lpips:
-    """LPIPS of a weights file, .safetensors or a .pth of tensors alone. Raises InputError naming
-    file and remedy.
-    """
+def load_lpips(path: Path) -> Lpips:
+    """LPIPS of a weights file, .safetensors or a .pth of tensors alone. Raises InputError."""
     if not path.is_file():
         raise InputError(f"{path} is missing; correct evaluate.lpips_weights")
     help_ = "one file with VGG-16's features.N and LPIPS' linK.model.1.weight is needed"
@@ -159,9 +154,7 @@ def timing(
 
 
 def frame_split(renderer: SceneRenderer, cameras: list[View], repeats: int) -> dict[str, Any]:
-    """Milliseconds of a frame in colour by part, the best sweep of `repeats` over all views, and
-    under what.
-    """
+    """Milliseconds of a colour frame by part, best of `repeats` over all views; size, threads."""
     sweeps = []
     for _ in range(repeats):
         frames = [frame_parts(renderer, view)[0] for view in cameras]
@@ -169,5 +162,5 @@ def frame_split(renderer: SceneRenderer, cameras: list[View], repeats: int) -> d
             {part: 1000 * sum(parts[part] for parts in frames) / len(cameras) for part in PARTS}
         )
     size = {"width": cameras[0].width, "height": cameras[0].height}
-    return min(sweeps, key=lambda sweep: sum(sweep.values())) | size | {
-        "threads": numba.get_num_threads(), "device": "cpu"}  # fmt: skip
+    best = min(sweeps, key=lambda sweep: sum(sweep.values()))
+    return best | size | {"threads": numba.get_num_threads(), "device": "cpu"}

@@ -1,6 +1,4 @@
-"""What each stage costs and what it gets wrong: the one table of which fact of a stage is its
-error, and the course of a scene's error through its stages.
-"""
+"""Cost and error of the stages: a table of which facts are errors, and a scene's course."""
 
 from __future__ import annotations
 
@@ -24,9 +22,8 @@ PERCENT, PIXELS, DECIBELS, LEVELS, NUMBER = (
 
 @dataclass(frozen=True)
 class Measure:
-    """A figure of a stage. `fact` of the manifest of `role`, an input of the report; `form` shows
-    it with its unit;
-    lower: less is better.
+    """A figure of a stage: `fact` of the manifest of `role`, an input of the report, in the format
+    `form`, with its unit; lower: less is better.
     """
 
     role: str
@@ -114,7 +111,7 @@ MEASURES: dict[str, tuple[Measure, ...]] = {  # by stage: its error is the first
 
 
 class Row(NamedTuple):
-    """A stage of the report's table: seconds, its figures in words, on what it was measured."""
+    """A stage in the report's table: seconds, figures in words, and the machine they are of."""
 
     stage: str
     seconds: float
@@ -125,13 +122,16 @@ class Row(NamedTuple):
 
 
 def figures_of(stage: str, facts: Mapping[str, dict[str, Any]]) -> list[str]:
-    """What was measured of a stage, in words, its error first; an arrow says which way is better.
+    """Figures of a stage in words, its error first; an arrow points to better values.
 
     Args: facts: of the report's inputs, by role.
     """
     values = [(of, facts.get(of.role, {}).get(of.fact)) for of in MEASURES[stage]]
-    known = [(of, value) for of, value in values if value is not None]
-    return [f"{of.form.format(value)} {'↓' if of.lower else '↑'} {of.words}" for of, value in known]
+    return [
+        f"{of.form.format(value)} {'↓' if of.lower else '↑'} {of.words}"
+        for of, value in values
+        if value is not None
+    ]
 
 
 def row_of(stage: str, manifest: Manifest, facts: Mapping[str, dict[str, Any]]) -> Row:
@@ -149,12 +149,12 @@ def row_of(stage: str, manifest: Manifest, facts: Mapping[str, dict[str, Any]]) 
 
 
 class Course(NamedTuple):
-    """How a scene came to what it is. Seconds count from the start, stage after stage.
+    """Error of a scene against time. Seconds count from the start, stage after stage.
 
     spans:    (stage, begin, end) in order; training: begin and end of this one.
-    plain:    PSNR of photos of one colour, which is what there is before training.
-    colors:   (seconds, PSNR) of the scene, had it been left then, as often as it was measured.
-    meanings: (stage, seconds, value) after each stage that made features; words: what these are.
+    plain:    PSNR of photos of one colour, that of a scene before training.
+    colors:   (seconds, PSNR) in the course of training.
+    meanings: (stage, seconds, value) after each stage that made features; words: the value's name.
     """
 
     spans: list[tuple[str, float, float]]
@@ -183,21 +183,21 @@ def course_of(
     colors = [(begin + factor * entry["seconds"], entry["psnr"]) for entry in trace]
     colors.append((ends[-1], trace[-1]["psnr"]))
     for fact, words in (("right", RIGHT), ("halves_agree", HALVES)):
-        asked = [
+        roles = [
             (stage, end, of.role)
             for stage, _, end in spans
             for of in MEASURES[stage]
             if of.fact == fact
         ]
-        values = [(stage, end, facts.get(role, {}).get(fact)) for stage, end, role in asked]
+        values = [(stage, end, facts.get(role, {}).get(fact)) for stage, end, role in roles]
         if meanings := [(stage, end, value) for stage, end, value in values if value is not None]:
             return Course(spans, (begin, end), plain, colors, meanings, words)
     return Course(spans, (begin, end), plain, colors, [], "")
 
 
 def stops(course: Course) -> list[tuple[str, float, float, float | None]]:
-    """(stopped after, seconds, PSNR, meaning by then), of earlier ends and, last, of the whole; of
-    a training that was not measured so early, none within.
+    """(stopped after, seconds, PSNR, meaning) at earlier ends and at the last; within training only
+    where its trace begins early enough.
     """
     begin, end = course.training
     seconds, values = zip(*course.colors, strict=True)
@@ -207,9 +207,9 @@ def stops(course: Course) -> list[tuple[str, float, float, float | None]]:
         if when >= seconds[0]:
             ends.append((words, when))
     ends += [(stage, end) for stage, _, end in course.spans if stage in ("train", "lift", "refine")]
-    found = []
+    rows = []
     for words, when in ends:
         color = float(np.interp(when, seconds, values)) if when > begin else course.plain
         meanings = [value for _, second, value in course.meanings if second <= when + 1e-9]
-        found.append((words, when, color, meanings[-1] if meanings else None))
-    return found
+        rows.append((words, when, color, meanings[-1] if meanings else None))
+    return rows

@@ -1,6 +1,4 @@
-"""Parts of the report's page: names and colours of labels, the headline, classes, pictures of test
-views.
-"""
+"""Parts of the report's page: names and colours of labels, headline, classes, pictures."""
 
 from __future__ import annotations
 
@@ -35,12 +33,12 @@ REPORT = SHARED / "report.html"
 
 
 def side(caption: str, base: str, over: str | None = None) -> dict[str, str | None]:
-    """One side of the slider: a picture and what lies over it, by their keys."""
+    """One side of the slider: a picture and its overlay, by their keys."""
     return {"caption": caption, "base": base, "over": over}
 
 
 def modes(pictures: list[dict[str, Any]]) -> list[list[Any]]:
-    """What the slider of a scene's report can compare, of the pictures that there are."""
+    """Comparisons that the slider of a report offers, by the pictures that there are."""
     there = {key for key, _, _ in pictures[0]["images"]}
     errors = side("colour error, 4 times", "error")
     wrong = side("render, wrong labels in red", "renders", "wrong")
@@ -66,9 +64,7 @@ def modes(pictures: list[dict[str, Any]]) -> list[list[Any]]:
 
 
 def label_names(inputs: dict[str, Path], figures: dict[str, Any]) -> list[str]:
-    """Names of the labels in the pictures: the capture's classes, or the scene's own labels where
-    it has none.
-    """
+    """Names of the labels in the pictures: the capture's classes, else the scene's labels."""
     classes = Capture.read(inputs["capture"]).class_names if "capture" in inputs else None
     classes = classes or (figures.get("segmentation") or {}).get("classes")
     if classes is None and "scene" in inputs:
@@ -78,7 +74,7 @@ def label_names(inputs: dict[str, Path], figures: dict[str, Any]) -> list[str]:
 
 
 def tiles(figures: dict[str, Any], gaussians: Gaussians) -> list[tuple[str, str, str]]:
-    """The headline: (value, what, detail)."""
+    """The headline: (value, name, detail)."""
     image, segmentation = figures["image"], figures.get("segmentation") or {}
     tiles = [(f"{image['psnr']:.1f} dB", "PSNR", f"SSIM {image['ssim']:.3f}")]
     if segmentation and segmentation["scene"]["miou"] is not None:
@@ -110,9 +106,7 @@ def tiles(figures: dict[str, Any], gaussians: Gaussians) -> list[tuple[str, str,
 def class_rows(
     figures: dict[str, Any], colors: dict[str, str]
 ) -> list[tuple[str, str, float, float | None]]:
-    """(class, colour, IoU, its teacher's IoU), best first; classes that occur nowhere are not
-    listed.
-    """
+    """(class, colour, IoU, its teacher's IoU) of the classes that occur, best first."""
     segmentation = figures.get("segmentation") or {}
     of_teacher = segmentation.get("teacher", {}).get("iou", {})
     of_scene = segmentation.get("scene", {}).get("iou", {})
@@ -127,10 +121,9 @@ def class_rows(
 def beside_truth(
     evaluation: Evaluation, names: list[str], inputs: dict[str, Path]
 ) -> list[dict[str, Any]]:
-    """A row a true class that the pictures show, the most pixels first, at most IN_LEGEND: its
-    `name`; the scene's `label` that is called so, None without one; its `share` of the labelled
-    pixels; of its pixels what they are
-    `taken` for: (name, share) of the classes of all rows, in their order, and of anything else.
+    """Rows of the confusion matrix, of the most frequent true classes, at most IN_LEGEND: `name`;
+    the scene's `label` of that name, or None; `share` of the labelled pixels; `taken`: (name, share
+    of its pixels) predicted as each class of the rows, and as anything else.
     """
     pictures = evaluation.pictures
     if not {"labels", "predicted"} <= pictures.keys():
@@ -141,34 +134,37 @@ def beside_truth(
         labels = pictures["predicted"][view]
         matrix += confusion(np.where(labels < 0, n, labels), pictures["labels"][view], n + 1)[:-1]
     pixels = matrix.sum(1)
-    kept = [int(k) for k in np.argsort(-pixels, kind="stable")[:IN_LEGEND] if pixels[k]]
-    known = (
+    classes = [int(k) for k in np.argsort(-pixels, kind="stable")[:IN_LEGEND] if pixels[k]]
+    labels_of_scene = (
         read_label_names(inputs["scene"], read_manifest(inputs["scene"]))
         if "scene" in inputs
         else names
     )
-    rows = dict(zip(kept, rows_of([names[k] for k in kept], known), strict=True))
-    found = []
-    for k in kept:
-        shares = matrix[k, kept] / pixels[k]
-        taken = [
-            *zip([names[other] for other in kept], shares, strict=True),
+    rows = dict(zip(classes, rows_of([names[k] for k in classes], labels_of_scene), strict=True))
+    table = []
+    for k in classes:
+        shares = matrix[k, classes] / pixels[k]
+        predictions = [
+            *zip([names[other] for other in classes], shares, strict=True),
             ("anything else", 1 - shares.sum()),
         ]
-        label = known[rows[k]] if rows[k] >= 0 else None
-        found.append(
-            {"name": names[k], "label": label, "share": pixels[k] / pixels.sum(), "taken": taken}
+        label = labels_of_scene[rows[k]] if rows[k] >= 0 else None
+        table.append(
+            {
+                "name": names[k],
+                "label": label,
+                "share": pixels[k] / pixels.sum(),
+                "taken": predictions,
+            }
         )
-    return found
+    return table
 
 
 def legend(pixels: Counter[int], names: list[str], colors: dict[str, str]) -> list[tuple[str, str]]:
-    """(name, colour) of the labels that cover the most pixels, in their order, and how many more
-    there are.
-    """
-    kept = sorted(label for label, _ in pixels.most_common(IN_LEGEND))
-    more = len(pixels) - len(kept)
-    return [(names[k], colors[names[k]]) for k in kept] + (
+    """(name, colour) of the labels of most pixels, in their order, and the number of the others."""
+    labels = sorted(label for label, _ in pixels.most_common(IN_LEGEND))
+    more = len(pixels) - len(labels)
+    return [(names[k], colors[names[k]]) for k in labels] + (
         [(f"and {more} more", "transparent")] if more else []
     )
 
@@ -176,8 +172,7 @@ def legend(pixels: Counter[int], names: list[str], colors: dict[str, str]) -> li
 def picture_rows(
     evaluation: Evaluation, names: list[str], count: int, out: Path
 ) -> tuple[list[dict[str, Any]], Counter[int]]:
-    """Pictures (key, URI, caption) of evenly spaced views, and pixels of each label in them; a PNG
-    of the first.
+    """Pictures (key, URI, caption) of some views, and pixels of each label; writes pictures.png.
 
     Raises: InputError if a picture holds a label that has no name.
     """
@@ -229,9 +224,7 @@ def counted(labels: np.ndarray) -> dict[int, int]:
 
 
 def rendered(template: Path, narrow: int = 700, **values: Any) -> str:
-    """A page of its template. Raises jinja2's UndefinedError for a value that it wants and is not
-    given.
-    """
+    """The page of a template. Raises jinja2's UndefinedError where a value is missing."""
     loader = jinja2.FileSystemLoader([template.parent, SHARED])
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined

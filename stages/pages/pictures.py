@@ -40,9 +40,7 @@ def colored(labels: np.ndarray, n: int) -> np.ndarray:
 
 
 def heat(image: np.ndarray, relevancy: np.ndarray) -> np.ndarray:
-    """A render u8 [H, W, 3] under the heat of a relevancy [H, W]: grey up to 0.5, then cyan to red
-    at 1.
-    """
+    """A render u8 [H, W, 3] under a relevancy [H, W] as heat: grey up to 0.5, then cyan to red."""
     grey = image.mean(-1, keepdims=True)
     warmth = (2 * relevancy - 1).clip(0, 1)[..., None]
     opacity = np.where(warmth > 0, 0.5 + 0.4 * warmth, 0)
@@ -63,9 +61,7 @@ def error_map(image: np.ndarray, truth: np.ndarray, gain: float = 4.0) -> np.nda
 
 
 def wrong_map(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Red, u8 [H, W, 4], where predicted classes are wrong; clear where they are right or nothing
-    is known.
-    """
+    """Red, u8 [H, W, 4], where predicted classes are wrong; clear where right or without truth."""
     wrong = (predicted != truth) & (truth != IGNORE)
     return np.where(wrong[..., None], np.array([230, 20, 40, 255], np.uint8), np.uint8(0))
 
@@ -91,7 +87,7 @@ def png(image: np.ndarray, path: Any) -> None:
 
 
 def svg(figure: Any) -> str:
-    """A figure as inline SVG, which is closed."""
+    """A figure as inline SVG; closes it."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None}, transparent=True)
     plt.close(figure)
@@ -102,17 +98,16 @@ def svg(figure: Any) -> str:
 def cameras(eyes: np.ndarray, ups: np.ndarray, points: np.ndarray, errors: np.ndarray) -> str:
     """Cameras and points from above and from the side, and each photo's error, as inline SVG.
 
-    Args: eyes, ups: [V, 3] places of the cameras and what is up to each, in the order of the
-      photos; points [N, 3];
-          errors: [V] pixels.
+    Args: eyes, ups: [V, 3] centres and upward directions of the cameras, in the order of the
+      photos; points [N, 3]; errors: [V] pixels.
     """
     matplotlib.use("Agg")
     up = ups.mean(0) / max(np.linalg.norm(ups.mean(0)), 1e-9)
     across = np.linalg.svd(np.eye(3) - np.outer(up, up))[0][:, 0]
     axes = np.column_stack([across, np.cross(up, across), up])
     near = np.abs(points - np.median(points, 0)).max(1) if len(points) else np.zeros(0)
-    shown = points[near <= np.quantile(near, 0.95)] @ axes if len(points) else np.zeros((0, 3))
-    shown, placed = shown[:: max(len(shown) // 1500, 1)], eyes @ axes
+    cloud = points[near <= np.quantile(near, 0.95)] @ axes if len(points) else np.zeros((0, 3))
+    cloud, path = cloud[:: max(len(cloud) // 1500, 1)], eyes @ axes
     with matplotlib.rc_context(
         {"svg.hashsalt": "cameras", "svg.fonttype": "none", "font.family": "sans-serif"}
     ):
@@ -120,9 +115,9 @@ def cameras(eyes: np.ndarray, ups: np.ndarray, points: np.ndarray, errors: np.nd
         for panel, (i, j), title in zip(
             panels, ((0, 1), (0, 2)), ("from above", "from the side"), strict=False
         ):
-            panel.scatter(*shown[:, [i, j]].T, s=1, color="#999999", linewidths=0)
-            panel.plot(*placed[:, [i, j]].T, color="#cccccc", linewidth=0.5)
-            panel.scatter(*placed[:, [i, j]].T, s=14, c=np.arange(len(placed)), cmap="viridis")
+            panel.scatter(*cloud[:, [i, j]].T, s=1, color="#999999", linewidths=0)
+            panel.plot(*path[:, [i, j]].T, color="#cccccc", linewidth=0.5)
+            panel.scatter(*path[:, [i, j]].T, s=14, c=np.arange(len(path)), cmap="viridis")
             panel.set_aspect("equal", "datalim")
             panel.set_title(f"cameras and points {title}", fontsize=10)
             panel.tick_params(labelsize=7)
@@ -133,9 +128,7 @@ def cameras(eyes: np.ndarray, ups: np.ndarray, points: np.ndarray, errors: np.nd
 
 
 def course(of: Course, test_psnr: float) -> str:
-    """What a scene would have been, had it been left earlier, as inline SVG: PSNR and what its
-    labels are worth against the seconds from the start, over bands of its stages.
-    """
+    """PSNR and accuracy of labels against seconds, over bands of the stages, as inline SVG."""
     matplotlib.use("Agg")
     with matplotlib.rc_context(
         {"svg.hashsalt": "course", "svg.fonttype": "none", "font.family": "sans-serif"}
@@ -162,8 +155,13 @@ def course(of: Course, test_psnr: float) -> str:
         panels[0, 0].plot(
             [0, of.training[0]], [of.plain] * 2, ":", color="#1f6feb", label="photos of one colour"
         )
-        panels[0, 0].plot(*zip(*of.colors, strict=True), color="#1f6feb", marker=".", markersize=4,
-                          label="training views")  # fmt: skip
+        panels[0, 0].plot(
+            *zip(*of.colors, strict=True),
+            color="#1f6feb",
+            marker=".",
+            markersize=4,
+            label="training views",
+        )
         panels[0, 0].plot(
             [last],
             [test_psnr],
@@ -196,9 +194,7 @@ def course(of: Course, test_psnr: float) -> str:
 
 
 def curves(trace: list[dict[str, float]], test_psnr: float) -> list[str]:
-    """Error against run time as inline SVG: PSNR with the test views' at the end, losses, number of
-    Gaussians.
-    """
+    """Training curves as inline SVG: PSNR, with the test views' at the end; losses; Gaussians."""
     matplotlib.use("Agg")
 
     seconds = [row["seconds"] for row in trace]

@@ -1,4 +1,4 @@
-"""What a scene started from, and what it leaves to the scenes after it, for the report's page."""
+"""Knowledge that a scene started from, and its lesson for later scenes, for the report's page."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from chebsplat.formats.knowledge import read_card
 
 
 class Started(NamedTuple):
-    """rows: (what, in words); lessons: (scene, trust, because, new in kind), most trusted first."""
+    """rows: (name, value in words); lessons: (scene, trust, reason, new in kind), by trust."""
 
     rows: list[tuple[str, str]]
     lessons: list[tuple[str, str, str, str]]
 
 
 def started(inputs: dict[str, Path], facts: dict[str, dict[str, Any]]) -> Started | None:
-    """None where the scene has no knowledge, or could make no use of it.
+    """The knowledge of a scene in words; None where it has none, or could not use it.
 
     Args: inputs: of the report; facts: of their manifests; both by role.
     """
@@ -25,28 +25,26 @@ def started(inputs: dict[str, Path], facts: dict[str, dict[str, Any]]) -> Starte
         return None
     document = read_card(inputs["knowledge"])
     card, solved = document["card"], document["lessons"]
-    taught = (
+    encoder = (
         f"taught over {card['n_rooms']} generated rooms"
         if "n_rooms" in card
         else document["teacher"]
     )
-    rows = [("the encoder of shape", taught)]
+    rows = [("the encoder of shape", encoder)]
     of = solved.get("of", [])
     used = sum(lesson["trust"] > 0 for lesson in of)
     count = f"{used} of {len(of)} are trusted" if of else "none: what ships, and nothing else"
     rows.append(("lessons of other scenes", count))
     rows += worth(refined) + left_behind(facts.get("learned", {}))
-    shown = [
+    lessons = [
         (lesson["scene"], f"{lesson['trust']:.2f}", lesson["why"], "yes" if lesson["new"] else "no")
         for lesson in sorted(of, key=lambda lesson: -lesson["trust"])
     ]
-    return Started(rows, shown)
+    return Started(rows, lessons)
 
 
 def worth(refined: dict[str, Any]) -> list[tuple[str, str]]:
-    """What knowledge was worth: how far half the training views foretell the other half, without it
-    and with it.
-    """
+    """Worth of knowledge: agreement of half the views with the other half, without and with it."""
     if "curve" not in refined:
         return []
     curve, belief = refined["curve"]["off"], refined["believed"]
@@ -62,9 +60,7 @@ def worth(refined: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def left_behind(lesson: dict[str, Any]) -> list[tuple[str, str]]:
-    """What the scene adds, by what later scenes trust it, and whether it is of a kind that was not
-    known.
-    """
+    """The scene's own lesson: novelty, size, and the evidence by which later scenes trust it."""
     if "rho" not in lesson:
         return []
     figures = f"ρ {lesson['rho']:.3f}, σ_f {lesson['sigma']:.3f}, ρ′ {lesson['novelty']:.3f}"

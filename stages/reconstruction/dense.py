@@ -1,6 +1,4 @@
-"""Points beside those that were matched: depth of the photos by a plane sweep, where several views
-agree on it; and far behind all of them, where a photo shows what no point is known of.
-"""
+"""Points beside matched ones: from depth by a plane sweep, and a backdrop far behind all others."""
 
 from __future__ import annotations
 
@@ -27,25 +25,22 @@ log = logging.getLogger("chebsplat")
 SIDE = 160  # pixels of the longer side that photos are reduced to
 # depths that are tried, evenly spaced in 1 / z; views that each is compared with
 DEPTHS, NEIGHBORS = 96, 8
-WITNESSES = 64  # views, the nearest, that confirm or deny what a view has found
+WITNESSES = 64  # views, the nearest, that confirm or deny a view's depth
 # of the nearest point in a photo (1st percentile), and of the farthest one in any (99th)
 NEAR, FAR = 0.7, 5.0
-MOST_COST, AGREE = 0.5, 2  # what counts: cost, views that confirm a depth
-# of the points in the cube of a middling one, and three: what few pixels show is seldom there
+MOST_COST, AGREE = 0.5, 2  # of a depth that counts: cost at most, views that confirm it
+# of the points in a median cube, and at least three: surfaces of few pixels are mostly wrong
 LEAST = 0.2
 MOST = 12_000  # points in all: the first Gaussians, which growth needs room beside
-CELLS = 20  # cells along the longer side of a photo, of which it is asked how many hold a point
-# of the pairs of cameras: of photos from all around something .35, of five other captures at most
-# .2
+CELLS = 20  # cells along the longer side of a photo, for the share of cells that hold a point
+# of the pairs of cameras: of photos all around an object .35, of five other captures at most .2
 FACING = 0.25
-BEHIND = 1.5  # times the farthest point: how deep what no point is known of is supposed to lie
+BEHIND = 1.5  # times the farthest point: the depth of the backdrop
 COVERED = 0.8  # part of the cells under which matched points leave too much of the photos empty
 
 
 def covered(Ks: np.ndarray, poses: np.ndarray, means: np.ndarray, size: tuple[int, int]) -> float:
-    """The share of the views' cells, CELLS along the longer side of `size`, in which a point [N, 3]
-    lies.
-    """
+    """Share of the views' cells, CELLS along the longer side of `size`, that hold a point."""
     return float(
         np.mean([cells_with(K, pose, means, size) for K, pose in zip(Ks, poses, strict=True)])
     )
@@ -54,22 +49,18 @@ def covered(Ks: np.ndarray, poses: np.ndarray, means: np.ndarray, size: tuple[in
 def cells_with(
     K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """Which cells of a photo of `size` (width, height) a point [N, 3] lies in, bool [rows,
-    columns].
-    """
+    """Cells of a photo of `size` (width, height) that hold a point [N, 3], bool [rows, columns]."""
     edge = max(size) / CELLS
-    held = np.zeros((math.ceil(size[1] / edge), math.ceil(size[0] / edge)), bool)
+    occupied = np.zeros((math.ceil(size[1] / edge), math.ceil(size[0] / edge)), bool)
     column, row = (in_photo(K, pose, means, size)[:, :2] // edge).astype(int).T
-    held[row, column] = True
-    return held
+    occupied[row, column] = True
+    return occupied
 
 
 def in_photo(
     K: np.ndarray, pose: np.ndarray, means: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """Pixels and depth [M, 3] of those of the points [N, 3] that lie in a photo of `size` (width,
-    height).
-    """
+    """Pixels and depth [M, 3] of the points [N, 3] within a photo of `size` (width, height)."""
     camera = means @ pose[:3, :3].T + pose[:3, 3]
     camera = camera[camera[:, 2] > 0]
     pixels = (camera @ K.T)[:, :2] / camera[:, 2:]
@@ -78,8 +69,7 @@ def in_photo(
 
 
 def wants_more(job: Job, capture: Capture, cloud: dict[str, Any], settings: SfmSection) -> bool:
-    """Whether points are added to a cloud, as `sfm.dense` says: to those that leave much of the
-    photos empty.
+    """True where `sfm.dense` adds points to a cloud; auto: where much of the photos is empty.
 
     Choices: depth that a capture brings, and generated views, which have it, need none of this.
     """
@@ -92,12 +82,12 @@ def wants_more(job: Job, capture: Capture, cloud: dict[str, Any], settings: SfmS
 
 
 def swept(job: Job, capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
-    """means, colors and seen_from of points that a plane sweep of the training views finds, as a
-    cloud has them, and depths f32 [V, h, w] of the cloud's views, 0 where they do not agree, of
-    photos reduced to SIDE.
+    """means, colors and seen_from of points by a plane sweep of the training views, as a cloud has
+    them, and depths f32 [V, h, w] of the cloud's views, of photos reduced to SIDE, 0 where views do
+    not agree.
 
-    Choices: test views give no points, and have no depth. Depths that are tried begin before what
-      is in the photo: points behind its edges, beside the camera, would have all of them end there.
+    Choices: test views give no points, and have no depth. Points in the photo alone bound the
+      depths that are tried: others, beside the camera, would draw these towards it.
     """
     row = {name: k for k, name in enumerate(capture.names)}
     rows = np.array([row[name] for name in cloud["names"]])
@@ -115,18 +105,22 @@ def swept(job: Job, capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
         for K, pose in zip(Ks, poses, strict=True)
     ]
     Ks[:, :2] /= factor
-    found = depth_of_photos(small, valid, Ks, poses, z, job.progress)
+    sweep = depth_of_photos(small, valid, Ks, poses, z, job.progress)
     depths = np.zeros((len(rows), *small.shape[1:3]), np.float32)
-    depths[used] = found
-    means, colors, seen = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0, np.int64)]
+    depths[used] = sweep
+    means, colors, view_of = (
+        [np.zeros((0, 3))],
+        [np.zeros((0, 3), np.uint8)],
+        [np.zeros(0, np.int64)],
+    )
     for view, index in enumerate(used):
-        pixels = np.argwhere(found[view] > 0)
-        means.append(unproject(found[view], Ks[view], poses[view], pixels))
+        pixels = np.argwhere(sweep[view] > 0)
+        means.append(unproject(sweep[view], Ks[view], poses[view], pixels))
         colors.append((small[view][tuple(pixels.T)] * 255).round().astype(np.uint8))
-        seen.append(np.full(len(pixels), index))
-    points = fused(np.concatenate(means), np.concatenate(colors), np.concatenate(seen))
+        view_of.append(np.full(len(pixels), index))
+    points = fused(np.concatenate(means), np.concatenate(colors), np.concatenate(view_of))
     total, count = sum(map(len, means)), len(points["means"])
-    share = total / max(found.size, 1)
+    share = total / max(sweep.size, 1)
     log.info(
         "a sweep of %d photos finds %.0f %% of their pixels' depth, %d points",
         len(used),
@@ -145,12 +139,10 @@ def depth_of_photos(
     z: list[np.ndarray],
     progress: Progress | None = None,
 ) -> np.ndarray:
-    """Depth f32 [V, h, w] of photos, 0 where none is known: by a plane sweep, and by planes where
-    there is no texture.
+    """Depth f32 [V, h, w] of photos by a plane sweep, by planes where texture lacks; 0 unknown.
 
-    Args:    colors f32 [V, h, w, 3] in [0, 1]; valid [V, h, w]: 1 where a pixel counts; Ks [V, 3,
-      3] in its pixels;
-             poses [V, 4, 4]; z: of each photo, the depths of some points in it.
+    Args: colors f32 [V, h, w, 3] in [0, 1]; valid [V, h, w]: 1 where a pixel counts; Ks [V, 3, 3]
+      in its pixels; poses [V, 4, 4]; z: of each photo, the depths of some points in it.
     Choices: a pixel counts where AGREE of the other views have its depth, and few see through it;
       so does what planes add to these.
     """
@@ -174,8 +166,8 @@ def depth_of_photos(
         neighbors = [int(k) for k in nearest[view, :NEIGHBORS] if k >= 0]
         if np.isfinite(near[view]) and len(neighbors) >= AGREE:
             tried = 1 / torch.linspace(1 / float(near[view]), 1 / float(far), DEPTHS)
-            found, costs = swept_depth(grey, counts, *cameras, view, neighbors, tried)
-            depth[view] = torch.where((costs < MOST_COST) & (counts[view] > 0.9), found, 0).numpy()
+            best, costs = swept_depth(grey, counts, *cameras, view, neighbors, tried)
+            depth[view] = torch.where((costs < MOST_COST) & (counts[view] > 0.9), best, 0).numpy()
     witnesses = nearest[:, :WITNESSES]
     depth = agreed(depth, Ks, poses, witnesses, AGREE)
     whole = np.stack([completed(*photo) for photo in zip(depth, colors, strict=True)])
@@ -183,11 +175,9 @@ def depth_of_photos(
 
 
 def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[str, Any]:
-    """The means of the points in each cube that holds enough of them (LEAST); seen from where the
-    first of them is.
+    """Means of the points in each cube that holds enough of them (LEAST); seen_from: the first's.
 
-    Choices: of twice as many cubes as points are wanted, since what lies off the surfaces fills
-      half of them.
+    Choices: twice as many cubes as MOST, since outliers off the surfaces fill half of them.
     """
     if len(means) == 0:
         return {"means": means, "colors": colors, "seen_from": seen_from}
@@ -202,9 +192,7 @@ def fused(means: np.ndarray, colors: np.ndarray, seen_from: np.ndarray) -> dict[
 
 
 def facing(poses: np.ndarray) -> float:
-    """The share of pairs of cameras [V, 4, 4] that have one another before them and look more than
-    90° apart.
-    """
+    """Share of pairs of cameras [V, 4, 4] that face one another, looking more than 90° apart."""
     eyes, forward = centers(poses), poses[:, 2, :3]
     before = np.einsum("ijk,ik->ij", eyes - eyes[:, None], forward) > 0
     return float((before & before.T & (forward @ forward.T < 0)).mean())
@@ -214,10 +202,9 @@ def backdrop(capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
     """means, colors and seen_from of points far behind all others, as a cloud has them: one in each
     cell of a training photo in which no point lies, of that cell's mean colour.
 
-    Choices: none unless FACING of the pairs of cameras face one another. What such a cell shows is
-      built otherwise from what lies nearest, which looks right from there, and stands before the
-      cameras on the other side. As deep as BEHIND times the farthest point in any photo (99th
-      percentile).
+    Choices: none unless FACING of the pairs of cameras face one another: without a backdrop
+      training fills such a cell with Gaussians near its camera, in the way of the opposite ones.
+      Its depth is BEHIND times that of the farthest point in any photo (99th percentile).
     """
     row, (width, height) = {name: k for k, name in enumerate(capture.names)}, capture.size
     Ks, poses = cloud["Ks"], cloud["cam_from_world"]
@@ -226,12 +213,14 @@ def backdrop(capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
     )
     depths = [in_photo(Ks[k], poses[k], cloud["means"], capture.size)[:, 2] for k in used]
     far = BEHIND * max((np.percentile(z, 99) for z in depths if len(z)), default=0.0)
-    means, colors, seen = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)], [np.zeros(0, np.int64)]
+    means, colors, view_of = (
+        [np.zeros((0, 3))],
+        [np.zeros((0, 3), np.uint8)],
+        [np.zeros(0, np.int64)],
+    )
     for k in used:
-        empty, view = (
-            ~cells_with(Ks[k], poses[k], cloud["means"], capture.size),
-            row[cloud["names"][k]],
-        )
+        empty = ~cells_with(Ks[k], poses[k], cloud["means"], capture.size)
+        view = row[cloud["names"][k]]
         small = Image.fromarray(capture.images[view]).resize(
             empty.shape[::-1], Image.Resampling.BOX
         )
@@ -240,22 +229,20 @@ def backdrop(capture: Capture, cloud: dict[str, Any]) -> dict[str, Any]:
                 empty.shape[::-1], Image.Resampling.NEAREST
             )
             empty &= np.asarray(counted)
-        pixels, scale = (
-            np.argwhere(empty),
-            np.array([empty.shape[1] / width, empty.shape[0] / height, 1.0]),
-        )
+        pixels = np.argwhere(empty)
+        scale = np.array([empty.shape[1] / width, empty.shape[0] / height, 1.0])
         means.append(unproject(np.full(empty.shape, far), scale[:, None] * Ks[k], poses[k], pixels))
         colors.append(np.asarray(small)[tuple(pixels.T)])
-        seen.append(np.full(len(pixels), k))
+        view_of.append(np.full(len(pixels), k))
     return {
         "means": np.concatenate(means),
         "colors": np.concatenate(colors),
-        "seen_from": np.concatenate(seen),
+        "seen_from": np.concatenate(view_of),
     }
 
 
 def reduced(image: np.ndarray, factor: int) -> np.ndarray:
-    """Means of blocks of [H, W, C], f32."""
+    """Means f32 of blocks of `factor` pixels a side of an image [H, W, C]."""
     height, width = (side // factor for side in image.shape[:2])
     blocks = np.asarray(image[: height * factor, : width * factor], np.float32)
     return np.asarray(blocks.reshape(height, factor, width, factor, -1).mean((1, 3)))

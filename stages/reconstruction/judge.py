@@ -1,6 +1,4 @@
-"""Whether a model that structure from motion made of photos is to be believed, and what to
-photograph otherwise.
-"""
+"""Checks of a model from structure from motion: doubts about it, and what to photograph better."""
 
 from __future__ import annotations
 
@@ -41,11 +39,10 @@ REMEDY = (
 
 
 class Pairs(NamedTuple):
-    """The pairs of a model's photos that have LEAST verified matches.
+    """The match graph of a model: pairs of its photos with LEAST or more verified matches.
 
-    images: ids [N] of the photos; rows: [P, 2] into them; confirmed: [P] the share of a pair's
-      matches that are points
-    of the model; level: the share of the pairs whose matches one homography explains.
+    images: ids [N] of the photos; rows: [P, 2] into them; confirmed: [P] share of a pair's matches
+    that are points of the model; level: share of the pairs whose matches one homography explains.
     """
 
     images: list[int]
@@ -81,52 +78,52 @@ def pairs(model: pycolmap.Reconstruction, database: Path) -> Pairs:
     )
 
 
-def misplaced(found: Pairs, most: float = CONTRADICTED) -> list[int]:
-    """Ids of photos that many of their pairs contradict, for they were put beside something that
-    only looks alike.
+def misplaced(graph: Pairs, most: float = CONTRADICTED) -> list[int]:
+    """Ids of photos whose place many of their pairs contradict, as where the scene repeats.
 
-    Args:    most: of a photo's pairs, that may contradict its place.
+    Args:    most: share of a photo's pairs that may contradict its place.
     Choices: the photo with the largest share of contradicting pairs goes first, and its pairs no
-      longer count. One pair alone tells nothing. Of groups then linked by no agreeing pair the
+      longer count. A single pair is no evidence. Of groups then linked by no agreeing pair the
       largest stays; photos without pairs stay, too. Where less than SOUND of all pairs agree,
-      matches are no witnesses, and all stay.
+      matches are not to be trusted, and all photos stay.
     """
-    if not len(found.confirmed) or np.mean(found.confirmed >= CONFIRMED) < SOUND:
+    if not len(graph.confirmed) or np.mean(graph.confirmed >= CONFIRMED) < SOUND:
         return []
-    n = len(found.images)
+    n = len(graph.images)
     agree, deny = np.zeros((n, n)), np.zeros((n, n))
-    for matrix, chosen in ((agree, found.confirmed >= CONFIRMED), (deny, found.confirmed < DENIED)):
-        i, j = found.rows[chosen].T
+    for matrix, mask in ((agree, graph.confirmed >= CONFIRMED), (deny, graph.confirmed < DENIED)):
+        i, j = graph.rows[mask].T
         matrix[i, j] = matrix[j, i] = 1
-    kept = np.ones(n, bool)
+    survivors = np.ones(n, bool)
     while True:
-        against = deny @ kept
-        share = np.where(kept & (against > 1), against / np.maximum(against + agree @ kept, 1), 0)
+        against = deny @ survivors
+        share = np.where(
+            survivors & (against > 1), against / np.maximum(against + agree @ survivors, 1), 0
+        )
         worst = np.lexsort((against, share))[-1]
         if share[worst] <= most:
             break
-        kept[worst] = False
-    held = np.flatnonzero(kept & agree.any(1))
-    _, group = connected_components(agree[np.ix_(held, held)], directed=False)
-    kept[held[group != np.bincount(group, minlength=1).argmax()]] = False
-    return [found.images[k] for k in np.flatnonzero(~kept)]
+        survivors[worst] = False
+    linked = np.flatnonzero(survivors & agree.any(1))
+    _, group = connected_components(agree[np.ix_(linked, linked)], directed=False)
+    survivors[linked[group != np.bincount(group, minlength=1).argmax()]] = False
+    return [graph.images[k] for k in np.flatnonzero(~survivors)]
 
 
-def judged(
+def judge_model(
     model: pycolmap.Reconstruction,
-    found: Pairs,
+    graph: Pairs,
     n_photos: int,
     others: list[int],
     n_misplaced: int,
     mapped_error: float,
 ) -> dict[str, Any]:
-    """What tells whether a model is right, and `doubts` in words.
+    """Figures by which to judge a model, and its `doubts` in words.
 
     Args: others: photos in each further model, which share nothing with this one; n_misplaced: left
-      out of it;
-          mapped_error: pixels, before what strays was left out.
+      out of it; mapped_error: reprojection error, pixels, before outliers were removed.
     """
-    images = [model.images[key] for key in found.images if model.images[key].has_pose]
+    images = [model.images[key] for key in graph.images if model.images[key].has_pose]
     side = max(max(camera.width, camera.height) for camera in model.cameras.values())
     facts: dict[str, Any] = {
         "how": "structure from motion",
@@ -134,17 +131,17 @@ def judged(
         "n_given": n_photos,
         "n_in_others": others,
         "n_misplaced": n_misplaced,
-        "n_undisputed": len(images) - len(misplaced(found, DISPUTED)),
+        "n_undisputed": len(images) - len(misplaced(graph, DISPUTED)),
         "n_points": model.num_points3D(),
         "points_a_view": float(np.median([image.num_points3D for image in images])),
         "track_length": round(float(model.compute_mean_track_length()), 2),
         "reprojection_error_px": round(float(model.compute_mean_reprojection_error()), 3),
         "reprojection_error": float(model.compute_mean_reprojection_error() / side),
         "mapped_error": float(mapped_error / side),
-        "pairs_agree": float(np.mean(found.confirmed >= CONFIRMED))
-        if len(found.confirmed)
+        "pairs_agree": float(np.mean(graph.confirmed >= CONFIRMED))
+        if len(graph.confirmed)
         else 0.0,
-        "pairs_level": found.level,
+        "pairs_level": graph.level,
         "angle_degrees": angle(
             model, {image.image_id: image.projection_center() for image in images}
         ),
@@ -162,74 +159,67 @@ def angle(model: pycolmap.Reconstruction, eyes: dict[int, np.ndarray]) -> float:
     return float(np.median(widest))
 
 
-def doubts(found: dict[str, Any]) -> list[str]:
-    """What speaks against a model, and what to do about it; nothing of a good one."""
-    absent, others = (
-        found["n_given"] - found["n_registered"] - found["n_misplaced"],
-        found["n_in_others"],
-    )
-    said = []
-    if others and absent > 0.1 * found["n_given"]:
-        said.append(
-            f"The photos fall into {len(others) + 1} groups that hardly meet; the largest is "
-            f"used, {absent} photos "
-            "are not: photograph what lies between, or make a scene of each."
+def doubts(facts: dict[str, Any]) -> list[str]:
+    """Doubts about a model, each with its remedy; none about a good one."""
+    absent = facts["n_given"] - facts["n_registered"] - facts["n_misplaced"]
+    others = facts["n_in_others"]
+    messages = []
+    if others and absent > 0.1 * facts["n_given"]:
+        messages.append(
+            f"The photos fall into {len(others) + 1} groups that hardly meet; the largest is used, "
+            f"{absent} photos are not: photograph what lies between, or make a scene of each."
         )
-    elif absent > 0.1 * found["n_given"]:
-        said.append(
-            f"{absent} of {found['n_given']} photos could not be placed and are left out; {REMEDY}."
+    elif absent > 0.1 * facts["n_given"]:
+        messages.append(
+            f"{absent} of {facts['n_given']} photos could not be placed and are left out; {REMEDY}."
         )
-    if n := found["n_misplaced"]:
-        said.append(
+    if n := facts["n_misplaced"]:
+        messages.append(
             f"{n} photos are left out that most of their matches contradict: something in "
             "the scene repeats."
         )
-    if found["pairs_agree"] < AGREE:
-        said.append(
-            f"Only {found['pairs_agree']:.0%} of the pairs of photos agree with where the model "
-            "puts them: something "
-            "repeats, mirrors or moves in the scene, or the lens changed; check the poses, and "
-            f"{REMEDY}."
+    if facts["pairs_agree"] < AGREE:
+        messages.append(
+            f"Only {facts['pairs_agree']:.0%} of the pairs of photos agree with where the model "
+            "puts them: something repeats, mirrors or moves in the scene, or the lens changed; "
+            f"check the poses, and {REMEDY}."
         )
-    if found["mapped_error"] > LOOSE:
-        said.append(
-            f"Points miss their photos by {found['mapped_error']:.1e} of their side: the lens or "
-            "what is shown moved "
-            "while it was photographed; lock focus and zoom."
+    if facts["mapped_error"] > LOOSE:
+        messages.append(
+            f"Points miss their photos by {facts['mapped_error']:.1e} of their side: the lens or "
+            "what is shown moved while it was photographed; lock focus and zoom."
         )
-    if found["points_a_view"] < SCARCE:
-        said.append(
-            f"A photo has only {found['points_a_view']:.0f} points (median); {REMEDY}, of "
+    if facts["points_a_view"] < SCARCE:
+        messages.append(
+            f"A photo has only {facts['points_a_view']:.0f} points (median); {REMEDY}, of "
             "more texture."
         )
-    return said
+    return messages
 
 
-def sentence(found: dict[str, Any]) -> str:
+def sentence(facts: dict[str, Any]) -> str:
     """The figures of a model in words."""
     return (
-        f"{found['n_registered']} of {found['n_given']} photos registered, {found['n_points']} "
-        "points in "
-        f"{found['track_length']:.1f} photos each, {found['reprojection_error_px']:.2f} px, "
-        f"{found['pairs_agree']:.0%} "
-        f"of the pairs agree, {found['angle_degrees']:.1f}° between rays."
+        f"{facts['n_registered']} of {facts['n_given']} photos registered, {facts['n_points']} "
+        f"points in {facts['track_length']:.1f} photos each, {facts['reprojection_error_px']:.2f} "
+        f"px, {facts['pairs_agree']:.0%} of the pairs agree, {facts['angle_degrees']:.1f}° "
+        "between rays."
     )
 
 
 def check(model: PhotoModel, least: float) -> None:
-    """Raise DataFailure on a model that is not to be believed."""
-    found, n_photos = model.judged, model.judged["n_given"]
+    """Raise DataFailure on a model of too few photos, or of photos that show no depth."""
+    facts, n_photos = model.judged, model.judged["n_given"]
     needed = max(math.ceil(least * n_photos), 3)
     if len(model.names) < needed:
-        more = f" {' '.join(found['doubts'])}" if found["doubts"] else ""
+        more = f" {' '.join(facts['doubts'])}" if facts["doubts"] else ""
         raise DataFailure(
             f"{len(model.names)} of {n_photos} photos registered; at least {needed} are needed "
             f"(pose.min_registered); {REMEDY}.{more}"
         )
-    if found["angle_degrees"] < FLAT or found["pairs_level"] > LEVEL:
+    if facts["angle_degrees"] < FLAT or facts["pairs_level"] > LEVEL:
         raise DataFailure(
             "the photos were taken from one place, or show one plane, which tells no depth: a "
-            "homography explains "
-            f"{found['pairs_level']:.0%} of the pairs, rays of a point meet at "
-            f"{found['angle_degrees']:.1f}°; {REMEDY}"
+            f"homography explains {facts['pairs_level']:.0%} of the pairs, rays of a point meet at "
+            f"{facts['angle_degrees']:.1f}°; {REMEDY}"
         )

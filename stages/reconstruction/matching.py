@@ -1,8 +1,6 @@
-"""Features of a capture's views and their matches, by pycolmap, in a database that mapping and
-triangulation read.
+"""Features of a capture's views and their matches, by pycolmap, in a database for mapping.
 
-Which views are matched with each other: all, those of near cameras, or those alike. Views are
-  counted 0...V-1 in the
+Pairs to match are all, those of near cameras, or those alike. Views are numbered 0...V-1 in the
 capture's order, which is that of their names. Pairs are int [P, 2], smaller index first, each once
 and sorted.
 """
@@ -30,7 +28,7 @@ Searched = SfmSection | PoseSection  # settings of features and pairs
 # a thread's share between two lines of progress; each such block of pairs indexes its views anew
 PHOTOS, PAIRS = 8, 64
 LEAST = 15  # matches of a pair that has any: pycolmap's own, of a free search
-LARGEST = 128  # features of a view, by size, that say how alike two views are
+LARGEST = 128  # features of a view, by size, by which the likeness of two views is measured
 FEW = 100  # views that are all matched with each other
 # degrees between two viewing directions that weigh like the capture's median distance of two
 # cameras
@@ -42,7 +40,7 @@ RATIO = 0.8  # Lowe's, of the distances of the nearest and the second nearest de
 
 
 def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray) -> Path:
-    """Extract SIFT from the capture's own pixels and match given pairs [P, 2] of its views.
+    """Extract SIFT from the capture's own pixels and match pairs [P, 2] of its views.
 
     Choices: views that occur in no pair have no features either.
     """
@@ -53,10 +51,8 @@ def match(job: Job, capture: Capture, settings: SfmSection, pairs: np.ndarray) -
 
 def with_features(job: Job, capture: Capture, settings: SfmSection, views: Sequence[int]) -> Path:
     """A database of views with SIFT from the capture's own pixels."""
-    folder, database = (
-        _write_images(job, capture, views),
-        empty_database(job.scratch / "database.db"),
-    )
+    folder = _write_images(job, capture, views)
+    database = empty_database(job.scratch / "database.db")
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "PINHOLE"
     if capture.loss_mask is not None:
@@ -70,7 +66,7 @@ def with_features(job: Job, capture: Capture, settings: SfmSection, views: Seque
 
 
 def empty_database(path: Path) -> Path:
-    """A new database in place of what may lie there."""
+    """A new database, in place of an old one."""
     pycolmap.logging.minloglevel = (
         pycolmap.logging.ERROR.value if hasattr(pycolmap.logging, "ERROR") else 2
     )
@@ -89,9 +85,7 @@ def extract(
     mode: pycolmap.CameraMode,
     settings: Searched,
 ) -> None:
-    """Add images of a folder to a database, with their cameras as `reader` and `mode` say, and with
-    their SIFT.
-    """
+    """Add images of a folder to a database, with cameras by `reader` and `mode`, and their SIFT."""
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.peak_threshold = settings.peak_threshold
     extraction.sift.max_num_features = settings.max_features
@@ -102,9 +96,7 @@ def extract(
 
 
 def match_freely(job: Job, database: Path, pairs: np.ndarray, settings: Searched) -> None:
-    """Match pairs of views [P, 2] as if nothing were known of their poses; what RANSAC verifies is
-    kept.
-    """
+    """Match pairs of views [P, 2] without poses, verified by RANSAC."""
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.use_gpu, matching.num_threads = False, n_threads()
     verification.ransac.random_seed = settings.seed
@@ -117,8 +109,7 @@ def match_freely(job: Job, database: Path, pairs: np.ndarray, settings: Searched
 
 
 def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capture) -> None:
-    """Match pairs of views [P, 2] along the epipolar lines that their poses make, which fit the
-    photos.
+    """Match pairs of views [P, 2] along the epipolar lines of poses that fit the photos.
 
     Choices: a pair of fewer than LEAST matches has none, as in a free search. Features of one
       block's views are in memory at once.
@@ -127,14 +118,14 @@ def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capt
     assert poses is not None
     with pycolmap.Database.open(database) as opened:
         ids = {int(image.name[:-4]): image.image_id for image in opened.read_all_images()}
-        opened.clear_two_view_geometries()  # those of the pairs that told whether the poses fit
+        opened.clear_two_view_geometries()  # those by which the poses were checked
         for some in _in_blocks(job, pairs.tolist(), PAIRS * n_threads(), "matching"):
             views, rows = np.unique(some, return_inverse=True)
             pixels = [opened.read_keypoints(ids[view])[:, :2] for view in views]
             descriptors = [opened.read_descriptors(ids[view]).data for view in views]
             lines = np.stack([fundamental(Ks[a], poses[a], Ks[b], poses[b]) for a, b in some])
-            found = along_lines(pixels, descriptors, rows.reshape(-1, 2), lines)
-            for (a, b), matches in zip(some, found, strict=True):
+            pair_matches = along_lines(pixels, descriptors, rows.reshape(-1, 2), lines)
+            for (a, b), matches in zip(some, pair_matches, strict=True):
                 if len(matches) < LEAST:
                     continue
                 geometry = pycolmap.TwoViewGeometry()
@@ -148,14 +139,12 @@ def match_along_lines(job: Job, database: Path, pairs: np.ndarray, capture: Capt
 def chosen_pairs(
     job: Job, database: Path, n: int, settings: Searched, poses: np.ndarray | None = None
 ) -> np.ndarray:
-    """Pairs of `n` views to match, int [P, 2], as `matching` of the settings says."""
+    """Pairs of `n` views to match, int [P, 2], by the setting `matching`."""
     mode = matching_mode(settings.matching, n, poses is not None)
     if mode == "posed":
         assert poses is not None
-        pairs, why = (
-            nearest_by_pose(poses, settings.n_matched),
-            (f"{settings.n_matched} nearest of each by its pose"),
-        )
+        pairs = nearest_by_pose(poses, settings.n_matched)
+        why = f"{settings.n_matched} nearest of each by its pose"
     elif mode == "sequential":
         pairs = in_sequence(_largest_descriptors(database, n), settings.n_matched)
         why = f"{IN_A_ROW} before and after each, {settings.n_matched} most alike"
@@ -168,22 +157,20 @@ def chosen_pairs(
 
 def _largest_descriptors(database: Path, n_views: int) -> list[np.ndarray]:
     """f32 [k, 128] of unit length per view, of its LARGEST features."""
-    found = [np.zeros((0, 128), np.float32)] * n_views
+    per_view = [np.zeros((0, 128), np.float32)] * n_views
     with pycolmap.Database.open(database) as opened:
         for image in opened.read_all_images():
             shape = opened.read_keypoints(image.image_id)[:, 2:]  # affine [n, 4], rows
             largest = np.argsort(-np.hypot(shape[:, 0], shape[:, 2]), kind="stable")[:LARGEST]
             some = opened.read_descriptors(image.image_id).data[largest].astype(np.float32)
-            found[int(image.name[:-4])] = some / np.maximum(
+            per_view[int(image.name[:-4])] = some / np.maximum(
                 np.linalg.norm(some, axis=1, keepdims=True), 1e-9
             )
-    return found
+    return per_view
 
 
 def _write_images(job: Job, capture: Capture, views: Iterable[int]) -> Path:
-    """The images of some of the capture's views, and where it has them their masks, as pycolmap
-    reads them.
-    """
+    """Write images of some of the capture's views, and masks where it has any, for pycolmap."""
     folder, masks = job.scratch / "images", job.scratch / "masks"
     folder.mkdir(parents=True, exist_ok=True)
     masks.mkdir(exist_ok=True)
@@ -196,33 +183,31 @@ def _write_images(job: Job, capture: Capture, views: Iterable[int]) -> Path:
 
 
 def _in_blocks(job: Job, items: list[Any], size: int, what: str) -> Iterator[list[Any]]:
-    """Blocks of so many items, with rate and time left: pycolmap says nothing while it works."""
+    """Blocks of so many items, with rate and time left: pycolmap reports no progress."""
     blocks = [items[at : at + size] for at in range(0, len(items), size)]
-    done = 0
+    count = 0
     for block, status in job.progress.track(blocks, len(blocks), what):
         yield block
-        done += len(block)
-        status["done"] = f"{done} of {len(items)}"
+        count += len(block)
+        status["done"] = f"{count} of {len(items)}"
 
 
 def _cameras_differ(capture: Capture) -> bool:
     return not np.allclose(capture.Ks, capture.Ks[:1])
 
 
-def matching_mode(wanted: str, n_views: int, posed: bool) -> str:
-    """`exhaustive`, `posed` or `sequential`: the one that is wanted, and for `auto` the one that
-    fits.
+def matching_mode(mode: str, n_views: int, posed: bool) -> str:
+    """`exhaustive`, `posed` or `sequential`: `mode`, and for `auto` the one that fits.
 
-    Choices: given poses choose pairs at any number of views; without poses few views are all
-      matched.
+    Choices: poses, where there are any, select the pairs; without them few views are all matched.
     """
-    if wanted == "auto":
+    if mode == "auto":
         return "posed" if posed else "exhaustive" if n_views <= FEW else "sequential"
-    return wanted
+    return mode
 
 
 def all_pairs(n_views: int) -> np.ndarray:
-    """All pairs."""
+    """All pairs of `n_views` views."""
     return np.stack(np.triu_indices(n_views, 1), 1)
 
 
@@ -238,9 +223,7 @@ def nearest_by_pose(cam_from_world: np.ndarray, n_neighbors: int) -> np.ndarray:
 
 
 def apart(cam_from_world: np.ndarray) -> np.ndarray:
-    """How far two views lie apart [V, V], in median distances and TURNs; infinite beyond APART and
-    with itself.
-    """
+    """Distance of views [V, V] in median distances and TURNs; infinite beyond APART and to self."""
     eye, forward = centers(cam_from_world), cam_from_world[:, 2, :3]
     distance = np.linalg.norm(eye[:, None] - eye[None], axis=-1)
     angle = np.degrees(np.arccos(np.clip(forward @ forward.T, -1, 1)))
@@ -251,16 +234,13 @@ def apart(cam_from_world: np.ndarray) -> np.ndarray:
 
 
 def in_sequence(descriptors: list[np.ndarray], n_neighbors: int) -> np.ndarray:
-    """Each view with IN_A_ROW before and after it, and with the `n_neighbors` most alike wherever
-    they are.
+    """Each view with IN_A_ROW before and after it, and with the `n_neighbors` most alike of all.
 
-    Args:    descriptors: per view [k, 128], of its largest features: those are seen from far and
-      near.
-    Choices: being alike is the number of matches between these few (mutual, by Lowe's ratio). That
+    Args:    descriptors: per view [k, 128], of its largest features, visible from far and near.
+    Choices: likeness is the number of matches between these few (mutual, by Lowe's ratio). That
       takes milliseconds a pair, needs no vocabulary, closes loops, and finds neighbours where names
-      say nothing about the order. With 128
-      features a view it chooses as well as given poses do: in a quarter of fox's pairs both keep 65
-        % of all inliers.
+      have no order. With 128 features a view it selects as well as poses do: in a quarter of fox's
+      pairs both keep 65 % of all inliers.
     """
     n = len(descriptors)
     alike = np.zeros((n, n))
@@ -276,21 +256,17 @@ def in_sequence(descriptors: list[np.ndarray], n_neighbors: int) -> np.ndarray:
 
 
 def nearest(cost: np.ndarray, count: int) -> np.ndarray:
-    """Pairs of each view with the `count` of least finite cost [V, V]; a pair counts if either view
-    chooses it.
-    """
+    """Pairs in which either view is among the other's `count` of least finite cost [V, V]."""
     cost = cost.copy()
     np.fill_diagonal(cost, np.inf)
     order = np.argsort(cost, 1, kind="stable")[:, :count]
-    chosen = np.zeros(cost.shape, bool)
-    np.put_along_axis(chosen, order, np.isfinite(np.take_along_axis(cost, order, 1)), 1)
-    return np.argwhere(np.triu(chosen | chosen.T, 1))
+    adjacent = np.zeros(cost.shape, bool)
+    np.put_along_axis(adjacent, order, np.isfinite(np.take_along_axis(cost, order, 1)), 1)
+    return np.argwhere(np.triu(adjacent | adjacent.T, 1))
 
 
 def n_matches(first: np.ndarray, second: np.ndarray) -> int:
-    """Mutual nearest neighbours by Lowe's ratio among descriptors f32 [n, 128] and [m, 128] of unit
-    length.
-    """
+    """Mutual nearest neighbours, by Lowe's ratio, among unit descriptors [n, 128] and [m, 128]."""
     if len(first) < 1 or len(second) < 2:
         return 0
     cosine = first @ second.T

@@ -1,6 +1,4 @@
-"""Whether the poses that a source brings fit its photos: matches against the epipolar lines that
-the poses make.
-"""
+"""Check of a source's poses against its photos: distances of matches to their epipolar lines."""
 
 from __future__ import annotations
 
@@ -21,61 +19,60 @@ from chebsplat.stages.sources.common import file_of
 log = logging.getLogger("chebsplat")
 
 MISFIT = 0.5  # pixels that the median match may miss its epipolar line by
-# times what it misses that of the pair's own fundamental matrix by: features may be coarse
+# times its distance to that of the pair's own fundamental matrix: features may be coarse
 OVER_FREE = 2.0
 SHARED = 30  # verified matches of a pair that counts
-LEAST = 6  # such pairs, without which nothing is said
-PROBED, FEATURES = 16, 2048  # pairs that tell; features of a view, where nothing else needs matches
+LEAST = 6  # such pairs, without which there is no verdict
+PROBED, FEATURES = 16, 2048  # pairs of the check; features of a view, where it alone needs matches
 
 
 class Fit(NamedTuple):
-    """given, free: median distances in pixels to the epipolar lines of the poses, and of each
-    pair's matches alone.
+    """Median distances of matches to epipolar lines, pixels: by_poses: of the source's poses;
+    free: of each pair's own fundamental matrix.
     """
 
-    given: float
+    by_poses: float
     free: float
     n_pairs: int
 
     @property
     def tells(self) -> bool:
-        """Whether so many pairs match that anything can be said."""
+        """True where enough pairs match for a verdict."""
         return self.n_pairs >= LEAST
 
     @property
     def misses(self) -> bool:
-        """Whether the poses do not fit."""
-        return self.tells and self.given > max(MISFIT, OVER_FREE * self.free)
+        """True where the poses do not fit."""
+        return self.tells and self.by_poses > max(MISFIT, OVER_FREE * self.free)
 
 
 def wants_adjustment(
     job: Job, capture: Capture, settings: SfmSection, database: Path | None = None
 ) -> bool:
-    """Whether the poses of a capture are to be adjusted to its photos, as `sfm.poses` says.
+    """True where `sfm.poses` asks to adjust a capture's poses; auto: where matches miss them.
 
     Args:    database: with matches of all views; without it some views are matched.
-    Choices: generated poses are exact, and those that came with tracks were made from these photos;
-      both are kept, untested. Others are kept where too few pairs match to tell.
+    Choices: generated poses are exact, and those with tracks were made from these photos; both are
+      kept, unchecked. Others are kept where too few pairs match for a verdict.
     """
     if settings.poses != "auto" or capture.cam_from_world is None:
         return settings.poses == "adjusted"
     if _exact(capture) or (capture.tracks is not None and len(capture.tracks)):
         return False
-    return measured(
-        job, capture, probed(job, capture, settings) if database is None else database
+    return check_poses(
+        job, capture, match_probe(job, capture, settings) if database is None else database
     ).misses
 
 
 def wants_lines(
     job: Job, capture: Capture, settings: SfmSection, database: Path, pairs: np.ndarray
 ) -> bool:
-    """Whether views are matched along the epipolar lines of their poses: where these are known to
-    fit the photos.
+    """True where poses fit the photos, so that views are matched along their epipolar lines.
 
-    Args:    database: with features of all views; PROBED of the pairs [P, 2] are matched in it to
-      find that out.
-    Choices: stricter than what asks for adjustment, for it also says no where too few pairs match,
-      and where features are coarse. Generated rooms lost by it (docs/results/photographs.md, "At
+    Args:    database: with features of all views; PROBED of the pairs [P, 2] are matched in it for
+      the check.
+    Choices: stricter than `wants_adjustment`: false also where too few pairs match, and where
+      features are coarse. Generated rooms lost by it (docs/results/photographs.md, "At
       equal seconds"), and are matched by a free search.
     """
     if (
@@ -86,8 +83,8 @@ def wants_lines(
     ):
         return False
     match_freely(job, database, _some_of(pairs), settings)
-    found = measured(job, capture, database)
-    return found.tells and found.given <= MISFIT
+    match_fit = check_poses(job, capture, database)
+    return match_fit.tells and match_fit.by_poses <= MISFIT
 
 
 def _exact(capture: Capture) -> bool:
@@ -99,24 +96,24 @@ def _some_of(pairs: np.ndarray) -> np.ndarray:
     return np.asarray(pairs[np.unique(np.linspace(0, len(pairs) - 1, PROBED).round().astype(int))])
 
 
-def measured(job: Job, capture: Capture, database: Path | None) -> Fit:
-    """How well the poses fit, by the matches of a database; in the facts and the log."""
-    found = Fit(0.0, 0.0, 0) if database is None else fit(database, capture)
-    job.facts |= {"epipolar_px": found.given, "epipolar_free_px": found.free}
+def check_poses(job: Job, capture: Capture, database: Path | None) -> Fit:
+    """`fit` of the matches of a database, in the facts and the log."""
+    pose_fit = Fit(0.0, 0.0, 0) if database is None else fit(database, capture)
+    job.facts |= {"epipolar_px": pose_fit.by_poses, "epipolar_free_px": pose_fit.free}
     log.info(
-        "given poses %s the photos: matches of %d pairs miss their epipolar lines by %.2f px, "
-        "%.2f where each pair is "
-        "free (medians)%s",
-        "do not fit" if found.misses else "fit", found.n_pairs, found.given, found.free,
-        "" if found.tells else f"; fewer than {LEAST} pairs match, too few to tell",
-    )  # fmt: skip
-    return found
+        "given poses %s the photos: matches of %d pairs miss their epipolar lines by %.2f px, %.2f "
+        "where each pair is free (medians)%s",
+        "do not fit" if pose_fit.misses else "fit",
+        pose_fit.n_pairs,
+        pose_fit.by_poses,
+        pose_fit.free,
+        "" if pose_fit.tells else f"; fewer than {LEAST} pairs match, too few to tell",
+    )
+    return pose_fit
 
 
-def probed(job: Job, capture: Capture, settings: SfmSection) -> Path | None:
-    """A database of PROBED pairs of neighbouring views, evenly chosen, and large features; None
-    without pairs.
-    """
+def match_probe(job: Job, capture: Capture, settings: SfmSection) -> Path | None:
+    """A database of PROBED pairs of neighbouring views and large features; None without pairs."""
     assert capture.cam_from_world is not None
     pairs = nearest_by_pose(capture.cam_from_world, settings.n_matched)
     if len(pairs) < LEAST:
@@ -126,8 +123,8 @@ def probed(job: Job, capture: Capture, settings: SfmSection) -> Path | None:
 
 
 def fit(database: Path, capture: Capture) -> Fit:
-    """How well the capture's poses agree with the verified matches of a database of its views."""
-    poses, given, free = capture.cam_from_world, [], []
+    """Fit of the capture's poses to the verified matches of a database of its views."""
+    poses, by_poses, free = capture.cam_from_world, [], []
     assert poses is not None
     with pycolmap.Database.open(database) as opened:
         row = {file_of(view): view for view in range(len(poses))}
@@ -145,12 +142,12 @@ def fit(database: Path, capture: Capture) -> Fit:
                 fundamental(capture.Ks[a], poses[a], capture.Ks[b], poses[b]), first, second
             )
             if np.isfinite(misses).all():
-                given.append(misses)
+                by_poses.append(misses)
                 free.append(sampson_distance(geometry.F, first, second))
-    if not given:
+    if not by_poses:
         return Fit(0.0, 0.0, 0)
     return Fit(
-        float(np.median(np.concatenate(given))),
+        float(np.median(np.concatenate(by_poses))),
         float(np.nanmedian(np.concatenate(free))),
-        len(given),
+        len(by_poses),
     )

@@ -1,6 +1,4 @@
-"""Triangulation by pycolmap: points of views whose poses are given, and adjusted where they miss
-the photos.
-"""
+"""Triangulation by pycolmap: points of views with poses, adjusted where these miss the photos."""
 
 from __future__ import annotations
 
@@ -28,13 +26,12 @@ def reconstruct(
 ) -> dict[str, Any]:
     """Match views, then triangulate their points.
 
-    Args:    adjusted: whether given poses are adjusted to the photos; None: as the matches say.
+    Args:    adjusted: true to adjust the poses to the photos; None: where matches miss them.
     Returns: names, Ks, cam_from_world; means, colors, seen_from, tracks; notes.
     Raises:  ConfigError where the capture has no poses.
     Choices: images are imported in the order of their names before extraction, which makes
       extraction, matching and triangulation reproducible. Test views take part in posing, never in
-      colouring. Where given poses fit the photos, matches are looked for along epipolar lines
-      alone.
+      colouring. Where the poses fit the photos, views are matched along epipolar lines alone.
     """
     if capture.cam_from_world is None:
         raise ConfigError(
@@ -66,12 +63,12 @@ def reconstruct(
         "%.2f px, %d points in %.1f views each",
         notes["reprojection_error_px"], model.num_points3D(), notes["track_length"],
     )  # fmt: skip
-    found = _collect(model, capture, [images[file_of(view)] for view in range(n)], settings)
-    return found | {"notes": notes | moved}
+    cloud = _collect(model, capture, [images[file_of(view)] for view in range(n)], settings)
+    return cloud | {"notes": notes | moved}
 
 
 def _triangulate(job: Job, capture: Capture, database: Path) -> pycolmap.Reconstruction:
-    """Points of known cameras; poses and intrinsics are kept as given."""
+    """Points under the capture's poses and intrinsics, which stay fixed."""
     assert capture.cam_from_world is not None
     model = pycolmap.Reconstruction()
     width, height = capture.size
@@ -103,12 +100,10 @@ def _collect(
     images: list[pycolmap.Image],
     settings: SfmSection,
 ) -> dict[str, Any]:
-    """Arrays of the model: cameras, points with a training view that sees them, colours from such
-    views.
+    """Arrays of the model: cameras, points that a training view sees, and colours from such views.
 
     Choices: points with a reprojection error above 4 px or seen only by test views are dropped; of
-      too many, those
-    with the longest tracks stay.
+      too many, those with the longest tracks stay.
     """
     row = {image.image_id: index for index, image in enumerate(images)}
     cameras = [model.cameras[image.camera_id] for image in images]

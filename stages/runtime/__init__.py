@@ -1,1 +1,1 @@
-"""What every stage runs in: its command, settings, device, progress and signals."""
+"""The runtime of all stages: command, settings, device, progress and signals."""

@@ -53,31 +53,25 @@ class Config(Section):
 
 
 def load(path: Path) -> Config:
-    """A config from a TOML or JSON file; sections that are not given keep their defaults. Raises
-    ConfigError.
-    """
+    """A config from a TOML or JSON file; absent sections have defaults. Raises ConfigError."""
     parse = parse_json if Path(path).suffix == ".json" else parse_toml
     return build(parse(path, "correct it, or pass another --config", ConfigError), str(path))
 
 
 def build(values: dict[str, Any], origin: str) -> Config:
-    """A checked config. Raises ConfigError naming the first bad key, with the nearest known
-    name.
-    """
+    """A checked config. Raises ConfigError naming the first bad key and the nearest valid one."""
     return checked(Config, values, origin)
 
 
 def checked(
     model: type[Model], values: Any, origin: str, error: type[ChebsplatError] = ConfigError
 ) -> Model:
-    """A model of pydantic's from values that somebody wrote. Raises `error`: one line about the
-    first bad key.
-    """
+    """A pydantic model of these values. Raises `error`: one line about the first bad key."""
     try:
         return model.model_validate(values)
     except ValidationError as faults:
         fault = faults.errors()[0]
-        where = ".".join(_shown(part) for part in fault["loc"])
+        where = ".".join(_printable(part) for part in fault["loc"])
         raise error(
             f"{origin}: {where}{': ' if where else ''}{_advice(fault, list(model.model_fields))}"
         ) from None
@@ -85,11 +79,15 @@ def checked(
 
 def known_keys() -> list[str]:
     """Every setting as `section.key`."""
-    return [f"{s}.{k}" for s, f in Config.model_fields.items() for k in f.annotation.model_fields]  # type: ignore[union-attr]
+    return [
+        f"{name}.{key}"
+        for name, section in Config.model_fields.items()
+        for key in section.annotation.model_fields  # type: ignore[union-attr]
+    ]
 
 
-def _shown(part: Any) -> str:
-    """Part of a key as a line of a message can hold it."""
+def _printable(part: Any) -> str:
+    """Part of a key, quoted and cut where a message of one line needs it."""
     return str(part) if re.fullmatch(r"[\w.-]{1,60}", str(part)) else repr(str(part)[:60])
 
 
@@ -98,9 +96,11 @@ def _advice(error: Any, first: list[str]) -> str:
         return str(error["ctx"]["error"])
     if error["type"] != "extra_forbidden":
         needed = WORDS.get(error["type"]) or error["msg"].replace("Input should be", "it must be")
-        held = error["input"]
+        value = error["input"]
         got = (
-            f"a {type(held).__name__}" if isinstance(held, (dict, list, tuple)) else f"{held!r:.60}"
+            f"a {type(value).__name__}"
+            if isinstance(value, (dict, list, tuple))
+            else f"{value!r:.60}"
         )
         return f"{needed} (got {got})"
     loc = [str(part) for part in error["loc"]]
@@ -109,10 +109,7 @@ def _advice(error: Any, first: list[str]) -> str:
         # a section of another name, perhaps an earlier one
         if not near and isinstance(error["input"], dict):
             near = [
-                key
-                for wanted in error["input"]
-                for key in known_keys()
-                if key.endswith(f".{wanted}")
+                key for child in error["input"] for key in known_keys() if key.endswith(f".{child}")
             ]
     else:
         elsewhere = [key for key in known_keys() if key.endswith("." + loc[-1])]

@@ -1,4 +1,4 @@
-"""What computes: an NVIDIA GPU where torch and gsplat can use one, otherwise the CPU, and why."""
+"""Choice of the device: an NVIDIA GPU where torch and gsplat can use one, otherwise the CPU."""
 
 from __future__ import annotations
 
@@ -11,20 +11,18 @@ DEVICES = ("auto", "cpu", "cuda")
 REMEDY = "`make setup device=cuda` adds it"
 
 
-def resolve(wanted: str) -> tuple[str, str]:
-    """What computes, `cpu` or `cuda`, and why it is not the GPU of a machine that has one ("":
-    nothing is to be said).
+def resolve(requested: str) -> tuple[str, str]:
+    """The device, `cpu` or `cuda`, and why a machine's GPU is not used, "" where there is none.
 
     Raises: ConfigError, with the remedy, on `cuda` where something is missing.
-    Choices: `auto` loads no torch to ask it on a machine without an NVIDIA driver; `cuda` asks it
-      in any case.
+    Choices: `auto` loads no torch on a machine without an NVIDIA driver; `cuda` does in any case.
     """
-    if wanted == "cpu" or (wanted == "auto" and not DRIVER.exists()):
+    if requested == "cpu" or (requested == "auto" and not DRIVER.exists()):
         return "cpu", ""
     lack = missing()
     if not lack:
         return "cuda", ""
-    if wanted == "cuda":
+    if requested == "cuda":
         raise ConfigError(f"--device cuda: {lack}; or use cpu, or auto")
     return "cpu", f"an NVIDIA driver was found, but {lack}: everything runs on the CPU"
 
@@ -39,9 +37,7 @@ def name_of(device: str) -> str:
 
 
 def missing() -> str:
-    """What a GPU lacks here to train on it, and what adds it: CUDA in torch, an answer, or gsplat;
-    "": nothing.
-    """
+    """Reason why no GPU can train here, with its remedy; "" where one can."""
     import torch
 
     if torch.version.cuda is None:

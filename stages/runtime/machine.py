@@ -1,6 +1,4 @@
-"""What seconds were measured on, of every process that worked on an artifact: processor, cores,
-threads, load.
-"""
+"""Seconds, processor, cores, threads and load of each process that worked on an artifact."""
 
 from __future__ import annotations
 
@@ -18,12 +16,12 @@ from chebsplat.formats.files import atomic_write, parse_json
 
 log = logging.getLogger("chebsplat")
 CPUS = Path("/proc/cpuinfo")  # which has no names on ARM
-KEPT = "processes.json"  # in the scratch folder of a stage that resumes
+PROCESSES = "processes.json"  # in the scratch folder of a stage that resumes
 
 
 @cache
 def processor() -> str:
-    """The processor's name where Linux tells it, otherwise its kind as LLVM calls it."""
+    """The processor's name by Linux, or else LLVM's name of its kind."""
     lines = CPUS.read_text().splitlines() if CPUS.exists() else []
     named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     if name := next(named, ""):
@@ -45,12 +43,10 @@ def load() -> float:
 
 @dataclass
 class Stopwatch:
-    """Seconds of this process, and of those before it whose work it goes on from; and what they
-    ran on.
+    """Seconds of this process and of earlier ones whose work it resumes, with their machines.
 
-    A stage that resumes calls `keep` whenever it has kept something in its scratch folder, and
-    `go_on` where it takes up what an earlier process has kept: so the seconds are those of the
-    work in the artifact, whoever did it.
+    A stage that resumes calls `keep` whenever it has saved something in its scratch folder, and
+    `go_on` where it resumes from such a save: so the seconds are those of all work in the artifact.
     """
 
     threads: int = 1
@@ -62,9 +58,7 @@ class Stopwatch:
         self.load = load()
 
     def processes(self) -> list[dict[str, Any]]:
-        """Of each process, in their order: processor, gpu, cores, threads, load at start and now,
-        seconds.
-        """
+        """processor, gpu, cores, threads, load at start and now, and seconds of each process."""
         of_machine = {
             "processor": processor(),
             "gpu": self.gpu,
@@ -75,13 +69,13 @@ class Stopwatch:
         return [*self.earlier, of_machine | {"load": [self.load, load()], "seconds": seconds}]
 
     def keep(self, scratch: Path) -> None:
-        """Remember beside what was kept what it has taken."""
-        atomic_write(scratch / KEPT, json.dumps(self.processes()))
+        """Write the processes so far beside a save in the scratch folder."""
+        atomic_write(scratch / PROCESSES, json.dumps(self.processes()))
 
     def go_on(self, scratch: Path) -> None:
-        """Count the processes that have made what is kept there, too."""
+        """Count the processes that have made the save in the scratch folder, too."""
         try:
-            self.earlier = parse_json(scratch / KEPT)
-        # a power cut may have spoiled it; what was kept is worth more than its seconds
+            self.earlier = parse_json(scratch / PROCESSES)
+        # a power cut may have damaged it; the save itself is worth more than its seconds
         except InputError as error:
             log.warning("seconds of what was done before are not counted: %s", error)

@@ -1,7 +1,7 @@
 """Ends of our processes: well, with a typed error, a crash, or by SIGINT, SIGTERM or SIGHUP.
 
 A signal raises `Stopped` in the main thread, so that nothing half made is left; a loop that can
-reach a better place within a moment defers it. Whoever cannot listen (a kernel is being compiled)
+reach a better place within a moment defers it. A process that cannot react (compiling a kernel)
 is killed by its run.
 """
 
@@ -27,7 +27,7 @@ from chebsplat.formats.files import OUTPUT, REFUSALS, explained
 log = logging.getLogger("chebsplat")
 SIGNALS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
 STREAMS = 2  # the highest number of a standard stream
-PATIENCE = 2.5  # seconds from being asked to being killed
+PATIENCE = 2.5  # seconds from the request to the kill
 KEPT = "what was finished is kept, and the same command goes on from there"
 
 
@@ -37,10 +37,10 @@ def exit_code(
     tell: Callable[[str], object] = log.error,
     raised: tuple[type[Exception], ...] = (),
 ) -> int:
-    """The door that all commands leave by: the action's code (None: 0), or that of what ends it.
+    """Run a command's action; returns its code (None: 0), or that of the error that ends it.
 
-    Args: folder: of a disk's error that names no file; tell: says a typed error or a stop; raised:
-      errors that are left to the caller, beside click's own.
+    Args: folder: of a disk's error that names no file; tell: prints a typed error or a stop;
+      raised: errors that are left to the caller, beside click's own.
     """
     try:
         with heeded(), explained(folder):
@@ -58,8 +58,8 @@ def exit_code(
 
 
 class _Output:
-    """Standard output whose refusals name it. The first is kept in `refusal`, since click tries
-    streams in silence; what comes after it is dropped.
+    """Standard output whose write errors name it. The first is stored in `refusal`, since click
+    silences errors; later output is dropped.
     """
 
     def __init__(self, stream: TextIO):
@@ -117,9 +117,9 @@ def streams(tell: Callable[[str], object]) -> Iterator[None]:
         sys.exit(error.exit_code)
 
 
-class Asked:
-    """What this process has been asked. `stop`: not at all, or what is raised; `since`: by the
-    monotonic clock.
+class StopRequest:
+    """A request that this process stop. `stop`: None until one comes, then the error to raise;
+    `since`: when, by the monotonic clock.
     """
 
     def __init__(self) -> None:
@@ -133,68 +133,64 @@ class Asked:
         """
         now = time.monotonic()
         if self.stop is None or now - self.since > PATIENCE:
-            self.stop, self.since = (
-                Stopped(number, f"stopped by {signal.Signals(number).name}; {KEPT}"),
-                now,
-            )
+            self.stop = Stopped(number, f"stopped by {signal.Signals(number).name}; {KEPT}")
+            self.since = now
             if not self.deferred:
                 raise self.stop
 
 
-_asked: Asked | None = None
+_request: StopRequest | None = None
 
 
 @contextmanager
 def heeded() -> Iterator[None]:
     """Signals raise `Stopped` within; one that is ignored (nohup) stays so. The outermost rules.
 
-    What breaks because a stop has come, an import that it fell into, is the stop and no crash; a
-    destructor, where nothing can be raised, says nothing of it.
+    An error that a stop causes, as in an import that it interrupts, is raised as the stop, not as a
+    crash; in a destructor, where nothing can be raised, it is silent.
     """
-    global _asked
-    outermost = _asked is None and threading.current_thread() is threading.main_thread()
-    asked, hook = _asked or Asked(), sys.unraisablehook
+    global _request
+    outermost = _request is None and threading.current_thread() is threading.main_thread()
+    request, hook = _request or StopRequest(), sys.unraisablehook
     before = {number: signal.getsignal(number) for number in SIGNALS} if outermost else {}
 
     def unless_stopped(unraisable: Any) -> None:
-        if asked.stop is None:
+        if request.stop is None:
             hook(unraisable)
 
     if outermost:
-        _asked, sys.unraisablehook = asked, unless_stopped
+        _request, sys.unraisablehook = request, unless_stopped
     for number, handler in before.items():
         if handler is not signal.SIG_IGN:
-            signal.signal(number, asked.heed)
+            signal.signal(number, request.heed)
     try:
         yield
     except Exception as error:
-        if asked.stop is not None:
-            raise asked.stop from error
+        if request.stop is not None:
+            raise request.stop from error
         raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
         if outermost:
-            _asked, sys.unraisablehook = None, hook
+            _request, sys.unraisablehook = None, hook
 
 
 @contextmanager
-def deferred() -> Iterator[Asked]:
-    """Nothing is raised within, but at the end: the block looks at `stop` itself, and comes to one
-    within a moment.
-    """
-    asked = _asked or Asked()
-    asked.deferred = True
+def deferred() -> Iterator[StopRequest]:
+    """Defer `Stopped` to the end of the block, which looks at `stop` itself every few moments."""
+    request = _request or StopRequest()
+    request.deferred = True
     try:
-        yield asked
+        yield request
     finally:
-        asked.deferred = False
-    if asked.stop is not None:
-        raise asked.stop
+        request.deferred = False
+    if request.stop is not None:
+        raise request.stop
 
 
 def end_itself() -> None:
-    """Ask this process to end, from a thread of its own, and kill it if it does not listen."""
+    """Ask this process to end, from another thread, and kill it if it does not react."""
     signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
     time.sleep(PATIENCE)
     os._exit(128 + signal.SIGTERM)

@@ -1,1 +1,1 @@
-"""Encoders of shape as ONNX graphs, what they are taught on, and what they predict."""
+"""Encoders of shape: surfaces and rooms that they are trained on, predictions, ONNX graphs."""

@@ -1,6 +1,4 @@
-"""From what knowledge says of points to a scene's channels, and from what a teacher says to those
-of knowledge.
-"""
+"""Translation between the channels of knowledge, of a scene, and of its teacher."""
 
 from __future__ import annotations
 
@@ -16,18 +14,18 @@ from chebsplat.formats.knowledge import Knowledge
 from chebsplat.labels.decode import decode_labels, shares
 from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.shape.point_inputs import PointInputs
-from chebsplat.stages.teacher_models.text_encoder import found
+from chebsplat.stages.teacher_models.text_encoder import match_names
 
-TEMPERATURE = 0.05  # of cosines between answers and words, chosen on office0, shuffled0 and room0
+TEMPERATURE = 0.05  # of cosines of answers with words, tuned on office0, shuffled0 and room0
 # settings of descriptors that an encoder depends on
 SEEN = ("n_angles", "max_degree", "anisotropy", "bandwidth")
 
 
 def inputs_of(path: Path, descriptors: Descriptors, knowledge: Knowledge) -> PointInputs:
-    """What the encoder of `knowledge`, which was read from `path`, sees of a scene.
+    """A scene's inputs of the encoder of `knowledge`, which was read from `path`.
 
     Raises: DataFailure where the scene shows no surface, or was described with other settings than
-      it was taught with.
+      the encoder was trained with.
     """
     if not len(descriptors.means):
         raise DataFailure(descriptors.notes["none"])
@@ -43,12 +41,13 @@ def inputs_of(path: Path, descriptors: Descriptors, knowledge: Knowledge) -> Poi
 
 
 def answered(knowledge: Knowledge, inputs: PointInputs) -> np.ndarray:
-    """What knowledge says of points: f32 [N, 2 d], in the teacher's channels, then in those of
-    words.
-    """
-    return (
-        PointEncoder.restored(knowledge.encoder, knowledge.weights).encode(inputs) @ knowledge.map
-    )
+    """Answers of knowledge at points, f32 [N, 2 d]: in the teacher's channels, then of words."""
+    return encoded(knowledge, inputs) @ knowledge.map
+
+
+def encoded(knowledge: Knowledge, inputs: PointInputs) -> np.ndarray:
+    """Features of shape of points, f32 [N, p]."""
+    return PointEncoder.restored(knowledge.encoder, knowledge.weights).encode(inputs)
 
 
 def into_channels(
@@ -57,11 +56,10 @@ def into_channels(
     """From answers [N, 2 d] to the scene's channels [N, C]: by the teacher's channels, or by words.
 
     Raises: InputError where the knowledge is of another teacher than the scene's; DataFailure where
-      it has no word for
-            any of its labels.
-    Choices: through the teacher's channels nothing is lost but what the scene leaves out. Where a
-      scene's features are codes of classes (noisy labels, labels of a source, segmenters), an
-      answer becomes the mean of the codes, weighted by how near it is to the embeddings of their
+      it has no word for any of its labels.
+    Choices: through the teacher's channels nothing is lost but channels that the scene leaves out.
+      Where a scene's features are codes of classes (noisy labels, labels of a source, segmenters),
+      an answer becomes the mean of the codes, weighted by its similarity to the embeddings of their
       names; a label without a word gets no vote.
     """
     half = len(knowledge.map[0]) // 2
@@ -78,9 +76,8 @@ def into_channels(
 def into_meanings(
     path: Path, knowledge: Knowledge, features: Features
 ) -> Callable[[int], np.ndarray]:
-    """What the teacher means by each entry of a view, f32 [h, w, d] of a view's number: in its
-    channels as knowledge has them, or the words of its labels; zero where it says nothing, or what
-    knowledge has no word for.
+    """Target of knowledge for each entry of a view, f32 [h, w, d] of a view's number: the teacher's
+    features in knowledge's channels, or the word of its label; zero without a label or a word.
 
     Raises: as `into_channels`.
     """
@@ -110,30 +107,25 @@ def to_knowledge(knowledge: Knowledge, features: Features) -> np.ndarray:
 
 
 def words_by_label(knowledge: Knowledge, features: Features) -> np.ndarray:
-    """The unit embedding of each label's word, f32 [L + 1, d]; zero of labels without one, and last
-    of no label.
-    """
-    rows = np.array([*found(features.label_names, knowledge.words), -1])
+    """Unit embedding of each label's word, f32 [L + 1, d]; zero of labels without one, and last."""
+    rows = np.array([*match_names(features.label_names, knowledge.words), -1])
     return np.where(rows[:, None] >= 0, units(knowledge.embeddings[rows]), 0).astype(np.float32)
 
 
 def of_features(features: Features) -> bool:
-    """Whether a scene's channels are those of its teacher, and not codes of classes."""
+    """True where a scene's channels are those of its teacher, and not codes of classes."""
     return bool(
         features.convention["kind"] == "onnx" and features.convention["output"] == "features"
     )
 
 
 def check_teacher(path: Path, knowledge: Knowledge, features: Features) -> None:
-    """Raises InputError where knowledge is of another teacher than the features, or of another
-    version of it.
-    """
+    """Raise InputError where knowledge is of another teacher or version than the features."""
     teacher, channels = features.convention["teacher"], features.channels
     if teacher != knowledge.teacher:
         raise InputError(
             f"{path} was taught for the teacher {knowledge.teacher}, the scene has {teacher}; "
-            "teach knowledge for it "
-            "(`chebsplat knowledge teach`)"
+            "teach knowledge for it (`chebsplat knowledge teach`)"
         )
     if channels is not None and channels.notes.get("digest") != knowledge.digest:
         raise InputError(
@@ -142,12 +134,11 @@ def check_teacher(path: Path, knowledge: Knowledge, features: Features) -> None:
 
 
 def words_of(path: Path, knowledge: Knowledge, features: Features) -> tuple[list[int], np.ndarray]:
-    """Labels of the scene that knowledge has a word for, and the unit embeddings f32 [L', d] of
-    these.
+    """Labels of the scene that knowledge has a word for, and these words' unit embeddings [L', d].
 
     Raises: DataFailure where there is none.
     """
-    rows = found(features.label_names, knowledge.words)
+    rows = match_names(features.label_names, knowledge.words)
     named = [label for label, row in enumerate(rows) if row >= 0]
     if not named:
         raise DataFailure(
@@ -160,7 +151,7 @@ def unnamed(knowledge: Knowledge, features: Features) -> list[str]:
     """Labels of the scene that knowledge has no word for: shape has no vote on them."""
     if of_features(features):
         return []
-    rows = found(features.label_names, knowledge.words)
+    rows = match_names(features.label_names, knowledge.words)
     return [name for name, row in zip(features.label_names, rows, strict=True) if row < 0]
 
 

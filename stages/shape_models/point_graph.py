@@ -1,8 +1,7 @@
-"""The point encoder as an ONNX graph, operation by operation as torch computes it, and its
-contract.
+"""The point encoder as an ONNX graph, operation by operation as in torch, and its contract.
 
 Written by hand: torch's own exporter traces for 20 s and more. The stage `onnx` compares it with
-  torch at every export.
+torch at every export.
 """
 
 from __future__ import annotations
@@ -21,13 +20,11 @@ if TYPE_CHECKING:
     from chebsplat.shape.point_encoder import PointEncoder, Scale, Standardize
 
 OPSET = 18
-Value = Any  # the name of what a node makes, a torch tensor, or a NumPy constant
+Value = Any  # the name of a node's output, a torch tensor, or a NumPy constant
 
 
 class Graph:
-    """Nodes in the order of their making. Dimensions of inputs and outputs are numbers, or names of
-    any size from 1.
-    """
+    """A graph under construction. Dimensions are numbers, or names, of any size from 1."""
 
     def __init__(self, **inputs: tuple[int, list[int | str]]):
         """inputs: by name, element type and shape."""
@@ -39,11 +36,11 @@ class Graph:
 
     def add(self, operator: str, *inputs: Value, **attributes: Any) -> str:
         """One node with one output; gives its name."""
-        made = f"{operator.lower()}_{len(self.nodes)}"
+        output = f"{operator.lower()}_{len(self.nodes)}"
         self.nodes.append(
-            helper.make_node(operator, [self._name(v) for v in inputs], [made], **attributes)
+            helper.make_node(operator, [self._name(v) for v in inputs], [output], **attributes)
         )
-        return made
+        return output
 
     def _name(self, value: Value) -> str:
         if isinstance(value, str):
@@ -60,16 +57,16 @@ class Graph:
         return self.add("Add", self.add("MatMul", values, layer.weight.T), layer.bias)
 
     def model(self, name: str, **outputs: tuple[str, list[int | str]]) -> ModelProto:
-        """outputs: by name, the float32 value that it is, and its shape. Raises
-        onnx.checker.ValidationError.
-        """
+        """The checked model. outputs: by name, a float32 value and its shape."""
         for output, (value, _) in outputs.items():
             self.nodes.append(helper.make_node("Identity", [value], [output]))
-        made = [
+        entries = [
             helper.make_tensor_value_info(o, TensorProto.FLOAT, shape)
             for o, (_, shape) in outputs.items()
         ]
-        graph: GraphProto = helper.make_graph(self.nodes, name, self.inputs, made, self.constants)
+        graph: GraphProto = helper.make_graph(
+            self.nodes, name, self.inputs, entries, self.constants
+        )
         opsets = [helper.make_opsetid("", OPSET)]
         version = helper.find_min_ir_version_for(opsets)
         model = helper.make_model(
@@ -90,9 +87,7 @@ def whole(*values: int) -> np.ndarray:
 
 
 def point_model(encoder: PointEncoder, answers: np.ndarray) -> ModelProto:
-    """The encoder, then a map W [p, d]: arrays of `PointInputs`, neighbors int64 -> answers
-    [points, d].
-    """
+    """The encoder, then the map `answers` [p, d]: from arrays of `PointInputs` to [points, d]."""
     n_scales, n_descriptors = encoder.settings["n_scales"], encoder.settings["n_descriptors"]
     kind = TensorProto.FLOAT
     inputs: dict[str, tuple[int, list[int | str]]] = {
@@ -117,15 +112,19 @@ def point_model(encoder: PointEncoder, answers: np.ndarray) -> ModelProto:
     for index, scale in enumerate(encoder.scales.children()):
         rows = graph.add("Gather", "neighbors", whole(index), axis=1)
         rows = graph.add("Squeeze", rows, whole(1))
-        pooled.append(_attended(graph, scale, embedded, rows, RADII[index]))  # type: ignore[arg-type]
-    seen = decoded = graph.add("Concat", *pooled, axis=-1)
+        pooled.append(
+            _attended(graph, scale, embedded, rows, RADII[index])  # type: ignore[arg-type]
+        )
+    context = decoded = graph.add("Concat", *pooled, axis=-1)
     for layer in list(encoder.decode)[::2]:
         decoded = _silu(graph, graph.linear(decoded, layer))
     features, constant = answers[:-1], answers[-1]  # the last feature is 1
-    said = graph.add(
-        "Add", graph.add("MatMul", graph.add("Concat", seen, decoded, axis=-1), features), constant
+    prediction = graph.add(
+        "Add",
+        graph.add("MatMul", graph.add("Concat", context, decoded, axis=-1), features),
+        constant,
     )
-    return graph.model("points", answers=(said, ["points", answers.shape[1]]))
+    return graph.model("points", answers=(prediction, ["points", answers.shape[1]]))
 
 
 def _silu(graph: Graph, values: str) -> str:
@@ -160,14 +159,14 @@ def _attended(graph: Graph, scale: Scale, embedded: str, neighbors: str, radius:
         )
         largest = graph.add("Where", graph.add("Greater", count, number(0)), largest, number(0))
         return graph.add("Concat", largest, mean, axis=-1)
-    normal, asked, learned = (
+    normal, query, learned = (
         _normalized(graph, tokens, scale.norm),
-        scale.asked(),
+        scale.project_query(),
         scale.norm(scale.token),
     )
-    scores = graph.add("Where", there, graph.add("MatMul", normal, asked), number(-1e9))
+    scores = graph.add("Where", there, graph.add("MatMul", normal, query), number(-1e9))
     itself = graph.add(
-        "Expand", (learned @ asked)[None, None], _sizes(graph, rows, 1, asked.shape[1])
+        "Expand", (learned @ query)[None, None], _sizes(graph, rows, 1, query.shape[1])
     )
     shares = graph.add("Softmax", graph.add("Concat", scores, itself, axis=1), axis=1)
     of_others = graph.add("Slice", shares, whole(0), whole(-1), whole(1))
@@ -178,9 +177,9 @@ def _attended(graph: Graph, scale: Scale, embedded: str, neighbors: str, radius:
     gathered = graph.add(
         "Add", graph.add("MatMul", of_others, normal), graph.add("Mul", of_itself, learned)
     )
-    gathered = graph.add("Reshape", gathered, whole(-1, asked.shape[0] * asked.shape[1]))
+    gathered = graph.add("Reshape", gathered, whole(-1, query.shape[0] * query.shape[1]))
     token = graph.add(
-        "Add", graph.add("MatMul", gathered, scale.answered().flatten(0, 1)), scale.token
+        "Add", graph.add("MatMul", gathered, scale.project_values().flatten(0, 1)), scale.token
     )
     return graph.add("Concat", _fed(graph, scale, token), mean, axis=-1)
 
@@ -220,10 +219,8 @@ def _relative(graph: Graph, rows: str, radius: float) -> str:
         "Sub", graph.add("Gather", "means", rows), graph.add("Unsqueeze", "means", whole(1))
     )
     offset = graph.add("Div", offset, number(radius))
-    normal, others = (
-        graph.add("Unsqueeze", "normals", whole(1)),
-        graph.add("Gather", "normals", rows),
-    )
+    normal = graph.add("Unsqueeze", "normals", whole(1))
+    others = graph.add("Gather", "normals", rows)
     along = dot(offset, normal)
     across = graph.add("Sub", offset, graph.add("Mul", along, normal))
     rise = graph.add("Sub", part(others, 2, 3), part(normal, 2, 3))
@@ -234,7 +231,7 @@ def _relative(graph: Graph, rows: str, radius: float) -> str:
 
 
 def point_contract(encoder: PointEncoder, knowledge: Knowledge) -> dict[str, Any]:
-    """What to feed the graph, in which units, and what comes out, as JSON-able values."""
+    """Inputs and outputs of the graph, with shapes, units and meaning, as JSON-able values."""
     n, scales, settings = "points", encoder.settings["n_scales"], encoder.settings
     radii = ", ".join(f"{r:g}" for r in RADII[:scales])
     own = (

@@ -1,6 +1,4 @@
-"""Points of a scene's surface, as shape is described of them: where depth shows it, a sweep, or a
-splat.
-"""
+"""Points of a scene's surface to describe shape at: from depth, from a plane sweep, or a splat."""
 
 from __future__ import annotations
 
@@ -22,48 +20,46 @@ from chebsplat.stages.reconstruction.thinning import even
 
 log = logging.getLogger("chebsplat")
 LEAST_SURE = 0.5  # of up, by the cameras
-LEAST_TOLD = 0.5  # of the pixels of a capture without depth, which a sweep must have found
+LEAST_SWEPT = 0.5  # of the pixels of a capture without depth, that must have swept depth
 # sources whose scene unit is the metre
 METRIC = ("generated", "replica", "scannet", "seven_scenes")
 N_NEIGHBORS = 16  # that give a point its normal and covariance
 
 
 class Cloud(NamedTuple):
-    """Points of a surface: means [P, 3] scene units, normals [P, 3] unit, towards a camera,
-    covariances [P, 3, 3].
-    """
+    """Points of a surface: means [P, 3], unit normals towards a camera, covariances [P, 3, 3]."""
 
     means: np.ndarray
     normals: np.ndarray
     covariances: np.ndarray
 
 
-def measured(points: Points) -> Cloud:
-    """The surface that points of depth show, as evenly as knowledge was taught it.
+def from_depth(points: Points) -> Cloud:
+    """The surface of points of depth, evenly spaced, as knowledge was trained on.
 
-    Raises: DataFailure where they show too little of one.
+    Raises: DataFailure where there are too few.
     """
     if len(points.means) <= N_NEIGHBORS:
         raise DataFailure(
             f"the depth shows {len(points.means)} points of a surface; shape cannot be told"
         )
-    kept = even(points)
-    if len(kept) == len(points.means):
+    rows = even(points)
+    if len(rows) == len(points.means):
         return Cloud(points.means, points.normals, points.covariances)
-    means = points.means[kept]
+    means = points.means[rows]
     covariances, normals = local_shape(means, N_NEIGHBORS)
-    normals[np.einsum("ni,ni->n", normals, points.normals[kept]) < 0] *= -1
+    normals[np.einsum("ni,ni->n", normals, points.normals[rows]) < 0] *= -1
     return Cloud(means, normals, covariances)
 
 
-def shown(
+def from_splat(
     parameters: dict[str, np.ndarray],
     poses: np.ndarray,
     Ks: np.ndarray,
     size: tuple[int, int],
     unit: float,
 ) -> Cloud:
-    """The surface that Gaussians show to views, for scenes whose points no depth has measured.
+    """The surface that Gaussians show to views, for splats without points of depth.
 
     Raises: DataFailure where they show too little of one.
     """
@@ -75,8 +71,8 @@ def shown(
     return facing(means, eyes)
 
 
-def swept(points: Points, width: int, unit: float) -> Cloud:
-    """The surface that swept depth of photos of this width shows.
+def from_sweep(points: Points, width: int, unit: float) -> Cloud:
+    """The surface of swept depth, of photos of this width.
 
     Raises: DataFailure where that is too little of one.
     """
@@ -98,18 +94,14 @@ def swept_Ks(points: Points, width: int) -> np.ndarray:
 
 
 def facing(means: np.ndarray, eyes: np.ndarray) -> Cloud:
-    """Points [P, 3] with the shape of their neighbours, and normals towards the cameras [P, 3] that
-    saw them.
-    """
+    """Points [P, 3] with local covariances, and normals towards the cameras `eyes` [P, 3]."""
     covariances, normals = local_shape(means, N_NEIGHBORS)
     normals[np.einsum("ni,ni->n", normals, eyes - means) < 0] *= -1
     return Cloud(means, normals, covariances)
 
 
 def up_of(poses: np.ndarray) -> tuple[np.ndarray, float]:
-    """Against gravity [3], and how sure that is. Choices: z, with a warning, where the cameras
-    cannot tell.
-    """
+    """Up [3] by the cameras, and its certainty; z, with a warning, where they disagree."""
     up, sure = common_up(poses)
     if sure >= LEAST_SURE:
         return up, sure
@@ -118,37 +110,33 @@ def up_of(poses: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def scene_unit(capture: Capture | None, means: np.ndarray) -> tuple[float, str]:
-    """Scene units of a metre, and what says so: the source's where it is metric or has depth,
-    otherwise the extent.
-    """
+    """Scene units of a metre, by `source`, if metric or with depth, else by `extent`; and which."""
     if capture is not None and (capture.depth is not None or capture.source.get("kind") in METRIC):
         return 1 / World.read(capture.source).scale, "source"
     return room_unit(means), "extent"
 
 
 def surface_in(capture: Capture, points: Points, unit: float) -> tuple[Cloud, str]:
-    """The surface that the capture's depth shows, or a sweep of its photos, and which of both it
-    is.
+    """The surface by the capture's depth, or by a sweep of its photos, and which of both it is.
 
     Raises: DataFailure where neither shows enough of one.
-    Choices: where fewer than half of the pixels have swept depth, things stand alone that walls
-      surround: shape was right for 70 % of what is near its points, where smoothed features were
-        for 82 % (two rooms, ten photos each).
-      What Gaussians show that ten photos have placed is right for half of them.
+    Choices: where fewer than LEAST_SWEPT of the pixels have swept depth, walls are missing about
+      objects: shape was right for 70 % of the Gaussians near its points, smoothed features for 82 %
+      (two rooms, ten photos each). On the surface of Gaussians of ten photos it is right for half.
     """
     if capture.depth is not None:
-        return measured(points), "depth"
+        return from_depth(points), "depth"
     if points.depths is None:
         raise DataFailure("the capture has no depth, and its photos were not swept for any")
     row = {name: view for view, name in enumerate(capture.names)}
     used = [k for k, name in enumerate(points.names) if not capture.is_test[row[name]]]
     share = float(np.mean(points.depths[used] > 0)) if used else 0.0
-    if share < LEAST_TOLD:
+    if share < LEAST_SWEPT:
         raise DataFailure(
             f"the capture has no depth, and a sweep of its photos finds that of {share:.0%} of "
             "their pixels: too little"
         )
-    return swept(points, capture.size[0], unit), "swept depth"
+    return from_sweep(points, capture.size[0], unit), "swept depth"
 
 
 def in_scene(of: Descriptors) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,4 @@
-"""Generated rooms as the point encoder is taught on them: their points, their shape, and what a 2D
-teacher says.
-"""
+"""Generated rooms to train the point encoder on: points, shape, a 2D teacher's features."""
 
 from __future__ import annotations
 
@@ -27,21 +25,26 @@ from chebsplat.synthetic.layout import KNOWLEDGE
 from chebsplat.synthetic.rays import RayCaster, intrinsics, walk
 from chebsplat.synthetic.shuffled import jitter, shuffled
 
-KINDS = (  # taken in turn by seed
-    "shuffled", "jittered office", "shuffled", "room", "shuffled", "jittered room", "shuffled", "office"
-)  # fmt: skip
+KINDS = (  # in turn by seed
+    "shuffled",
+    "jittered office",
+    "shuffled",
+    "room",
+    "shuffled",
+    "jittered room",
+    "shuffled",
+    "office",
+)
 FEW_VIEWS = (3, 15)  # of the photos of a room that is half seen
 LEAST_SWEPT = 10  # photos of a room whose depth is swept, at least
 STRETCH = (0.85, 1.2)  # of a room of other proportions, along each axis
 WIDTH, HEIGHT = 320, 240
-DENSITY = (0.62, 1.38)  # of the number of points asked for: scenes differ
+DENSITY = (0.62, 1.38)  # of the setting's number of points: scenes differ
 N_NEIGHBORS = 16  # that give a point its normal and covariance
 
 
 class Room(NamedTuple):
-    """Inputs of N points, mean unit features [N, d], how many views see each [N], and its label
-    [N], -1: none.
-    """
+    """Inputs of N points, mean unit features [N, d], numbers of views [N], labels [N], -1 none."""
 
     inputs: PointInputs
     features: np.ndarray
@@ -52,17 +55,16 @@ class Room(NamedTuple):
 def rooms_of(
     seed: int, settings: TeachSection, network: TeacherInference, matrix: np.ndarray
 ) -> list[Room]:
-    """A room furnished, photographed, seen by the teacher, and described: as depth has it, worn
-    (`worn`), as few of its photos show it, and as their sweep does (`swept`).
+    """Four versions of a generated room with the teacher's features: by depth, with worn points
+    (`worn`), by the depth of few photos, and by a sweep of photos (`swept`).
 
     Args: seed: of `synthetic.seeds.KNOWLEDGE`; matrix [C, d]: from the teacher's channels to those
       of scenes.
     Raises: ValueError on another seed.
-    Choices: labels are there to measure by; nothing is taught from them. Points of the worn room
-      are taught what the teacher says of the places that they were moved from; points of few
-      photos, and of a sweep, what it says in all of them. Every other room that few photos show has
-      other proportions, too: worlds differ in these. A sweep that finds nothing leaves the room as
-        depth has it once more.
+    Choices: labels serve for measuring alone. Worn points have the teacher's features of the places
+      that they were moved from; points of few photos, and of a sweep, those of all photos. Every
+      other room of few photos is stretched, too, as proportions of worlds differ. Where the sweep
+      finds nothing, the version by depth comes once more.
     """
     if seed not in KNOWLEDGE:
         raise ValueError(f"seed {seed} is not one for knowledge: {KNOWLEDGE}")
@@ -78,24 +80,24 @@ def rooms_of(
     clean = described(means, eyes)
     mean, n_views = averaged(means, depth, features, features.shape[-1], Ks, poses)
     moved, rows, adrift = worn(means, clean.normals, rng)
-    seen = np.where(adrift, 0, n_views[rows])
+    n_views_worn = np.where(adrift, 0, n_views[rows])
     rooms = [
         Room(clean, mean, n_views, named),
-        Room(described(moved, eyes[rows]), mean[rows], seen, named[rows]),
+        Room(described(moved, eyes[rows]), mean[rows], n_views_worn, named[rows]),
     ]
     few = np.sort(rng.permutation(len(poses))[: int(np.exp(rng.uniform(*np.log(FEW_VIEWS))))])
     some, lookers, called = surface(depth[few], labels[few], K, poses[few], count, rng)
     mean, n_views = averaged(some, depth, features, features.shape[-1], Ks, poses)
     stretch = rng.uniform(*STRETCH, 3) if rng.random() < 0.5 else np.ones(3)
     rooms.append(Room(described(some * stretch, lookers * stretch), mean, n_views, called))
-    found = swept(images, depth, K, poses, rng)
-    if len(found.means) <= N_NEIGHBORS:
+    sweep = swept(images, depth, K, poses, rng)
+    if len(sweep.means) <= N_NEIGHBORS:
         return [*rooms, rooms[0]]
     mean, n_views = averaged(
-        found.means, depth, features, features.shape[-1], Ks, poses, SWEPT_WITHIN
+        sweep.means, depth, features, features.shape[-1], Ks, poses, SWEPT_WITHIN
     )
-    _, nearest = cKDTree(means).query(found.means)
-    return [*rooms, Room(described(*found), mean, n_views, named[nearest])]
+    _, nearest = cKDTree(means).query(sweep.means)
+    return [*rooms, Room(described(*sweep), mean, n_views, named[nearest])]
 
 
 def described(means: np.ndarray, eyes: np.ndarray) -> PointInputs:
@@ -108,27 +110,25 @@ def described(means: np.ndarray, eyes: np.ndarray) -> PointInputs:
 def worn(
     means: np.ndarray, normals: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points as scenes have them whose depth is only rendered: [M, 3], the rows they were, and
-    which of them float.
+    """Points with errors as of rendered depth [M, 3], their rows, and which of them float.
 
-    Choices: a share of the points; they leave the surface along its normal, by offsets that change
-      slowly over it (half a metre to a metre, and a few hands), and by noise; some float in front
-      of it.
+    Choices: a share of the points, displaced along the normal by offsets that vary slowly over the
+      surface (wavelengths of .4 to 1.2 m and of .1 to .3 m) and by noise; some float before it.
     """
-    kept = rng.permutation(len(means))[: int(rng.uniform(0.4, 1) * len(means))]
-    normal = normals[kept]
-    where = means[kept] + 0.3 * normal  # sides of a thing differ, too
-    offset = np.full(len(kept), rng.uniform(-0.02, 0.04))
+    rows = rng.permutation(len(means))[: int(rng.uniform(0.4, 1) * len(means))]
+    normal = normals[rows]
+    where = means[rows] + 0.3 * normal  # both sides of an object differ, too
+    offset = np.full(len(rows), rng.uniform(-0.02, 0.04))
     for largest, wavelengths in ((0.05, (0.4, 1.2)), (0.03, (0.1, 0.3))):
         waves = rng.normal(size=(64, 3)) * 2 * np.pi / np.sqrt(3) / rng.uniform(*wavelengths)
         phases = rng.uniform(0, 2 * np.pi, 64)
         offset = offset + rng.uniform(0, largest) * np.sqrt(2 / 64) * np.cos(
             where @ waves.T + phases
         ).sum(1)
-    adrift = rng.random(len(kept)) < rng.uniform(0, 0.04)
-    offset = np.where(adrift, np.abs(rng.normal(0, 0.15, len(kept))), offset)
+    adrift = rng.random(len(rows)) < rng.uniform(0, 0.04)
+    offset = np.where(adrift, np.abs(rng.normal(0, 0.15, len(rows))), offset)
     noise = rng.uniform(0.001, 0.015) * rng.normal(size=where.shape)
-    return means[kept] + offset[:, None] * normal + noise, kept, adrift
+    return means[rows] + offset[:, None] * normal + noise, rows, adrift
 
 
 def swept(
@@ -138,10 +138,9 @@ def swept(
     poses: np.ndarray,
     rng: np.random.Generator,
 ) -> Surface:
-    """The surface that a sweep of LEAST_SWEPT or more of the photos finds, as in a scene without
-    depth.
+    """The surface by a sweep of LEAST_SWEPT or more of the photos, as in a scene without depth.
 
-    Args: depth [V, H, W]: true; 200 pixels of each photo bound what is tried, as matched points do.
+    Args: depth [V, H, W]: true; 200 pixels of each photo bound the sweep, as matched points do.
     """
     least = min(LEAST_SWEPT, len(poses))
     some = np.sort(
@@ -150,9 +149,9 @@ def swept(
     factor = max(round(max(images.shape[1:3]) / SIDE), 1)
     colors = np.stack([reduced(image, factor) for image in images[some]]) / 255
     Ks = np.tile(K * [[1 / factor], [1 / factor], [1]], (len(some), 1, 1))
-    z = [rng.choice(seen[np.isfinite(seen)], 200) for seen in depth[some]]
-    found = depth_of_photos(colors, np.ones(colors.shape[:3], np.float32), Ks, poses[some], z)
-    return swept_surface(found, Ks, poses[some])
+    z = [rng.choice(photo[np.isfinite(photo)], 200) for photo in depth[some]]
+    depths = depth_of_photos(colors, np.ones(colors.shape[:3], np.float32), Ks, poses[some], z)
+    return swept_surface(depths, Ks, poses[some])
 
 
 def photographed(
@@ -178,9 +177,7 @@ def surface(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """About `count` points [N, 3] that views see, the cameras that saw them [N, 3], and their
-    labels [N].
-    """
+    """About `count` visible points [N, 3], the cameras that saw them [N, 3], their labels [N]."""
     means, eyes, named = [], [], []
     for view, eye in enumerate(centers(poses)):
         pixels = np.argwhere(np.isfinite(depth[view]))
@@ -191,15 +188,13 @@ def surface(
         eyes.append(np.tile(eye, (len(pixels), 1)))
         named.append(labels[view][pixels[:, 0], pixels[:, 1]])
     points = np.concatenate(means)
-    kept = thin(points, count)
-    return points[kept], np.concatenate(eyes)[kept], np.concatenate(named)[kept]
+    rows = thin(points, count)
+    return points[rows], np.concatenate(eyes)[rows], np.concatenate(named)[rows]
 
 
 def prepare(folder: Path, seed: int, settings: TeachSection, matrix: np.ndarray) -> int:
-    """Keep a room in the folder, unless it is there; returns the seed. Runs in a process of its
-    own.
-    """
-    path = kept_as(folder, seed)
+    """Write a room into the folder, unless it is there; returns its seed. In its own process."""
+    path = room_path(folder, seed)
     if path.is_file():
         return seed
     network = TeacherInference(
@@ -218,14 +213,14 @@ def prepare(folder: Path, seed: int, settings: TeachSection, matrix: np.ndarray)
     return seed
 
 
-def kept_as(folder: Path, seed: int) -> Path:
-    """Where a room is kept."""
+def room_path(folder: Path, seed: int) -> Path:
+    """The file of a room."""
     return folder / f"{seed}.npz"
 
 
-def held(folder: Path, seed: int) -> list[Room]:
-    """A room that `prepare` kept: clean, worn, half seen, and swept."""
-    with np.load(kept_as(folder, seed)) as stored:
+def load_room(folder: Path, seed: int) -> list[Room]:
+    """A room that `prepare` wrote: clean, worn, half seen, and swept."""
+    with np.load(room_path(folder, seed)) as stored:
         return [
             Room(
                 PointInputs(*(stored[f"{name}{number}"] for name in PointInputs._fields)),

@@ -1,1 +1,1 @@
-"""Where a capture can come from: one module for each kind of source."""
+"""Sources of a capture: one module for each kind."""

@@ -1,6 +1,4 @@
-"""From frames to the fields of a capture: images and what belongs to them as pinhole views of one
-size.
-"""
+"""Assembly of a capture from frames: images and their maps as pinhole views of one size."""
 
 from __future__ import annotations
 
@@ -42,8 +40,8 @@ from chebsplat.stages.sources.pictures import (
 
 WORKERS = 4
 MOST_EMPTY = 1 / 3  # of the views that see a point
-OWN_SIDE = 1600  # pixels: what photos as taken are reduced to, as in published comparisons
-COMPARED = 8  # views whose variance is held against their photos'
+OWN_SIDE = 1600  # pixels: size limit of photos as taken, as in published comparisons
+COMPARED = 8  # views whose variance is compared with their photos'
 
 
 def assemble(
@@ -54,13 +52,13 @@ def assemble(
     Choices: `max_views` picks evenly from the naturally sorted frames. Images are reduced to
       `max_side` by averaging, and undistorted in the same step where a lens bends them
       (`resampled`); depth, labels and masks take the nearest pixel of the file. Smaller views are
-      padded at the right and the bottom, where the loss mask is false, as it is in a photo that is
-      all transparent. Depth is taken only if every frame of the source has it; pixels of a frame
-      without labels have none.
+      padded at the right and the bottom, where the loss mask is false, as in a photo that is all
+      transparent. Depth is used only if every frame of the source has it; pixels of a frame without
+      labels have none.
     Raises:  InputError naming a bad file, DataFailure under `min_views` or where no label has a
       name.
     """
-    frames, notes = chosen(listing, settings)
+    frames, notes = choose_frames(listing, settings)
     shapes = [geometry(frame.camera, settings.max_side) for frame in frames]
     full = (
         len(frames),
@@ -81,10 +79,8 @@ def assemble(
             stacks[name][k, : shapes[k].height, : shapes[k].width] = view[name]
 
     def share_kept(k: int) -> float:
-        camera, pixels = (
-            frames[k].camera,
-            stacks["images"][k, : shapes[k].height, : shapes[k].width],
-        )
+        camera = frames[k].camera
+        pixels = stacks["images"][k, : shapes[k].height, : shapes[k].width]
         with open_photo(frames[k].image, (camera.width, camera.height), listing.upright) as (
             image,
             _,
@@ -110,18 +106,20 @@ def assemble(
     if "depth" in stacks:
         fields["depth"] = stacks["depth"]
     if "labels" in stacks:
-        wanted = class_names or listing.class_names
         kind, raw = labels.resolved(listing, stacks.pop("labels"))
         fields["labels"], fields["class_names"], remarks = labels.indexed(
-            raw, listing.label_names, wanted, kind
+            raw, listing.label_names, class_names or listing.class_names, kind
         )
         notes += remarks
         source["labels"] = labels.line(listing, kind, fields["labels"])
     if "pseudo_labels" in stacks:
-        wanted = fields.get("class_names") or class_names or listing.class_names
-        own = listing.pseudo_names, wanted and tuple(wanted)
-        found = labels.indexed(stacks["pseudo_labels"], *own, what="Pseudo label")
-        fields["pseudo_labels"], fields["class_names"], remarks = found
+        classes = fields.get("class_names") or class_names or listing.class_names
+        fields["pseudo_labels"], fields["class_names"], remarks = labels.indexed(
+            stacks["pseudo_labels"],
+            listing.pseudo_names,
+            classes and tuple(classes),
+            what="Pseudo label",
+        )
         fields["confidence"] = stacks["confidence"]
         notes += remarks
     if listing.empty:
@@ -141,19 +139,17 @@ def assemble(
         )
         source["undistorted"] = models
     fields["variance_kept"] = float(np.mean(shares))
-    return fields | {"altered": lambda wanted: altered(frames, listing, wanted, settings.max_side)}
+    return fields | {"altered": lambda names: altered(frames, listing, names, settings.max_side)}
 
 
 def altered(
-    frames: list[Frame], listing: Listing, wanted: set[str], max_side: int
+    frames: list[Frame], listing: Listing, names: set[str], max_side: int
 ) -> Iterator[tuple[str, Camera, Any]]:
-    """Name, camera and photo of the `wanted` views that are undistorted or reduced, but of no face
-    of a photo.
-    """
+    """Name, camera and photo of those of the views `names` that are altered; none of faces."""
     for frame in frames:
         camera = frame.camera
         changed = camera.model in DISTORTED or max(camera.width, camera.height) > max_side
-        if frame.name in wanted and changed and camera.model != EQUIRECTANGULAR:
+        if frame.name in names and changed and camera.model != EQUIRECTANGULAR:
             with open_photo(frame.image, (camera.width, camera.height), listing.upright) as (
                 image,
                 _,
@@ -170,23 +166,21 @@ def as_taken(photos: Iterable[tuple[str, Camera, Any]]) -> dict[str, Any]:
         factor = min(1.0, OWN_SIDE / max(image.size))
         width, height = (max(round(side * factor), 1) for side in image.size)
         small.append(np.asarray(image.resize((width, height), Image.Resampling.BOX)))
-        held = camera.colmap
-        held.rescale(width, height)
-        lenses.append([name, camera.model, [float(value) for value in held.params], width, height])
+        lens = camera.colmap
+        lens.rescale(width, height)
+        lenses.append([name, camera.model, [float(value) for value in lens.params], width, height])
     if not small:
         return {}
-    taken = np.zeros(np.max([(len(small), *photo.shape) for photo in small], 0), np.uint8)
-    for place, photo in zip(taken, small, strict=True):
+    stack = np.zeros(np.max([(len(small), *photo.shape) for photo in small], 0), np.uint8)
+    for place, photo in zip(stack, small, strict=True):
         place[: photo.shape[0], : photo.shape[1]] = photo
-    return {"taken": taken, "lenses": lenses}
+    return {"taken": stack, "lenses": lenses}
 
 
 def empty_stacks(
     listing: Listing, frames: list[Frame], full: tuple[int, int, int], notes: list[str]
 ) -> dict[str, np.ndarray]:
-    """Empty stacks of what the views will have, by name; notes on what only some of them have are
-    added.
-    """
+    """Empty stacks of the maps of the views, by name; adds notes on maps that only some have."""
     stacks = {"images": np.zeros((*full, 3), np.uint8), "loss_mask": np.zeros(full, bool)}
     empties = {"depth": np.float32(np.nan), "labels": np.int32(-1), "pseudo_labels": np.int32(0)}
     for name, empty in (empties | {"confidence": np.float16(0)}).items():
@@ -204,15 +198,14 @@ def empty_stacks(
 
 
 def in_empty_space(points: np.ndarray, fields: dict[str, Any], listing: Listing) -> np.ndarray:
-    """Which of a source's points [N, 3] lie where photos are transparent, bool [N]; a note says how
-    many.
+    """Mask [N] of a source's points [N, 3] that lie in empty space; adds a note with their number.
 
-    Choices: those that more than MOST_EMPTY of the views which have them in sight see as empty; a
-      silhouette may be a pixel off. Without this they would stay, and turn black.
+    Choices: points at a transparent pixel in more than MOST_EMPTY of the views that they project
+      into; a silhouette may be a pixel off. Without this they would stay, and turn black.
     """
-    empty, seen = np.zeros(len(points)), np.zeros(len(points))
+    empty, visible_count = np.zeros(len(points)), np.zeros(len(points))
     if not listing.empty:
-        return empty > seen
+        return empty > visible_count
     for name, K, pose in zip(fields["names"], fields["Ks"], fields["cam_from_world"], strict=True):
         clear = listing.empty.get(name, np.zeros(fields["images"].shape[1:3], bool))
         local = points @ pose[:3, :3].T + pose[:3, 3]
@@ -222,9 +215,9 @@ def in_empty_space(points: np.ndarray, fields: dict[str, Any], listing: Listing)
             (local[:, 2] > 0) & ((place >= 0) & (place < clear.shape[::-1])).all(1)
         )
         column, row = place[here].astype(int).T
-        seen[here] += 1
+        visible_count[here] += 1
         empty[here] += clear[row, column]
-    lost: np.ndarray = empty > MOST_EMPTY * seen
+    lost: np.ndarray = empty > MOST_EMPTY * visible_count
     if lost.any():
         fields["source"]["notes"].append(
             f"{lost.sum()} of {len(points)} points lie in empty space and are left out."
@@ -233,9 +226,7 @@ def in_empty_space(points: np.ndarray, fields: dict[str, Any], listing: Listing)
 
 
 def give_split(fields: dict[str, Any], tests: set[str], origin: str) -> None:
-    """Set `is_test` by name, or note that the views that are used leave one side of the split
-    empty.
-    """
+    """Set `is_test` by name, or note that the views in use leave one side of the split empty."""
     is_test = np.array([name in tests for name in fields["names"]])
     if is_test.any() and not is_test.all():
         fields["is_test"] = is_test
@@ -246,16 +237,16 @@ def give_split(fields: dict[str, Any], tests: set[str], origin: str) -> None:
         )
 
 
-def chosen(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list[str]]:
+def choose_frames(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list[str]]:
     """The frames to read, and the notes so far."""
-    notes, given = list(listing.notes), len(listing.frames)
+    notes, n_listed = list(listing.notes), len(listing.frames)
     frames = [
         frame for frame in listing.frames if frame.pose is None or np.isfinite(frame.pose).all()
     ]
-    if len(frames) < given:
+    if len(frames) < n_listed:
+        lost = n_listed - len(frames)
         notes.append(
-            f"{given - len(frames)} of {given} frames have a pose that is not finite and are left "
-            "out."
+            f"{lost} of {n_listed} frames have a pose that is not finite and are left out."
         )
     if len(frames) < settings.min_views:
         raise DataFailure(
@@ -268,14 +259,12 @@ def chosen(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list
         picked = np.linspace(0, len(frames) - 1, settings.max_views).round().astype(int)
         notes.append(f"{len(picked)} of {len(frames)} views are used (ingest.max_views).")
         frames = [frames[k] for k in picked]
-    if not listing.upright:  # plain photos have the cameras that they are given
-        given_frames = frames
+    if not listing.upright:  # upright photos have cameras of their size
+        before = frames
         frames = [
             replace(frame, camera=scaled(frame.camera, header(frame.image)[0])) for frame in frames
         ]
-        changed = [
-            new for new, old in zip(frames, given_frames, strict=True) if new.camera != old.camera
-        ]
+        changed = [new for new, old in zip(frames, before, strict=True) if new.camera != old.camera]
         if changed:
             notes.append(
                 f"Cameras of {len(changed)} views are scaled to their photos, which have another "
@@ -291,7 +280,7 @@ def chosen(listing: Listing, settings: IngestSection) -> tuple[list[Frame], list
 
 
 def face_names(name: str) -> list[str]:
-    """What the views are called that a photo of all directions gives."""
+    """Names of the faces of a photo of all directions."""
     return [f"{name}.{face}" for face in FACES]
 
 
@@ -313,9 +302,7 @@ def faces(frame: Frame) -> list[Frame]:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """The pinhole view made of a photo: K [3, 3] and size in its own pixels; factor: its pixels per
-    photo pixel.
-    """
+    """A photo's pinhole view: K [3, 3], size in its pixels; factor: its pixels per photo pixel."""
 
     K: np.ndarray
     width: int
@@ -324,9 +311,7 @@ class Geometry:
 
 
 def geometry(camera: Camera, max_side: int) -> Geometry:
-    """The view's camera: undistorted first, then reduced until no side exceeds `max_side`; never
-    enlarged.
-    """
+    """The view's camera: undistorted, then reduced until no side exceeds `max_side`."""
     plain = undistorted(camera)
     (fx, fy, cx, cy), width, height = plain.pinhole, plain.width, plain.height
     factor = min(1.0, max_side / max(width, height))
@@ -338,10 +323,9 @@ def geometry(camera: Camera, max_side: int) -> Geometry:
 
 
 def positions(camera: Camera, view: Geometry) -> np.ndarray:
-    """Where the centres of a view's pixels lie in its photo: f64 [2, H, W] (x, y) in photo pixels.
+    """Positions f64 [2, H, W] (x, y), in photo pixels, of the centres of a view's pixels.
 
-    Choices: beyond the radius at which a distortion polynomial turns back, the photo has no such
-      pixel: -1.
+    Choices: -1 beyond the radius at which a distortion polynomial is no longer monotonic.
     """
     if camera.model not in DISTORTED:
         x = (np.arange(view.width) + 0.5) * camera.width / view.width
@@ -349,8 +333,8 @@ def positions(camera: Camera, view: Geometry) -> np.ndarray:
         return np.stack(np.meshgrid(x, y))
     grid = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     pixels = np.stack([*grid, np.ones((view.height, view.width))], -1).reshape(-1, 3)
-    found = camera.colmap.img_from_cam(pixels @ (camera.turned @ np.linalg.inv(view.K)).T)
-    at = np.asarray(found, float).T.reshape(2, view.height, view.width)
+    distorted = camera.colmap.img_from_cam(pixels @ (camera.turned @ np.linalg.inv(view.K)).T)
+    at = np.asarray(distorted, float).T.reshape(2, view.height, view.width)
     (x_down, x_right), (y_down, y_right) = (np.gradient(side) for side in at)
     plain = (
         (x_right > 0) & (y_down > 0) & (x_right * y_down > x_down * y_right)
@@ -359,10 +343,10 @@ def positions(camera: Camera, view: Geometry) -> np.ndarray:
 
 
 def read_view(
-    frame: Frame, listing: Listing, view: Geometry, at: np.ndarray, wanted: set[str]
+    frame: Frame, listing: Listing, view: Geometry, at: np.ndarray, kinds: set[str]
 ) -> dict[str, np.ndarray]:
-    """images u8 [H, W, 3], loss_mask, opaque bool [H, W]; where `wanted`, depth, labels,
-    pseudo_labels, confidence [H, W].
+    """Maps of a view: images u8 [H, W, 3], loss_mask and opaque bool [H, W]; those of `kinds` that
+    the frame has: depth, labels, pseudo_labels, confidence [H, W].
     """
     camera, size = frame.camera, (frame.camera.width, frame.camera.height)
     inside = within(at, size)
@@ -372,24 +356,24 @@ def read_view(
     inside &= opaque  # of empty space there is no depth, nor a label
     if frame.mask is not None:
         counts &= companion(frame.mask, size, at) > 0
-    if "depth" in wanted and frame.depth is not None and listing.depth_offset is not None:
+    if "depth" in kinds and frame.depth is not None and listing.depth_offset is not None:
         z = from_beside(frame.depth, listing, view)
         fields["depth"] = np.where(inside, z, np.float32(np.nan))
-    elif "depth" in wanted and frame.depth is not None:
+    elif "depth" in kinds and frame.depth is not None:
         place, field = at, size
         if listing.depth_camera is not None:
             place, field = moved(at, camera, listing.depth_camera)
         stored = companion(frame.depth, field, place, DEEP, "16-bit depth").astype(np.float32)
-        known = within(place, field) & inside & ~np.isin(stored, listing.no_depth)
+        valid = within(place, field) & inside & ~np.isin(stored, listing.no_depth)
         if frame.sureness is not None:
-            known &= companion(frame.sureness, field, place) > 0
+            valid &= companion(frame.sureness, field, place) > 0
         fields["depth"] = np.where(
-            known, stored / np.float32(listing.depth_scale), np.float32(np.nan)
+            valid, stored / np.float32(listing.depth_scale), np.float32(np.nan)
         )
-    if "labels" in wanted and frame.labels is not None:
+    if "labels" in kinds and frame.labels is not None:
         fields["labels"] = np.where(inside, labels.read(frame, listing, size, at), np.int32(-1))
     if (
-        "pseudo_labels" in wanted
+        "pseudo_labels" in kinds
         and frame.pseudo_labels is not None
         and frame.confidence is not None
     ):
@@ -403,9 +387,9 @@ def read_view(
 
 
 def from_beside(path: Path, listing: Listing, view: Geometry) -> np.ndarray:
-    """z-depth f32 [H, W] of a view by a depth camera beside it; nan where that does not see it.
+    """z-depth f32 [H, W] of a view by a depth camera beside it; nan where that measures none.
 
-    Choices: of the depth image's pixels that fall into one of the view the nearest counts.
+    Choices: of several depth pixels that project into one of the view the nearest counts.
     """
     camera = listing.depth_camera
     assert camera is not None and listing.depth_offset is not None
@@ -414,8 +398,8 @@ def from_beside(path: Path, listing: Listing, view: Geometry) -> np.ndarray:
     pose[:3, 3] = -listing.depth_offset
     pixels = np.argwhere(~np.isin(stored, listing.no_depth))
     points = unproject(stored / listing.depth_scale, own.K, pose, pixels)
-    seen = project(points, view.K, np.eye(4), (view.width, view.height))
-    columns, rows, z = seen[np.isfinite(seen[:, 0])].T
+    projected = project(points, view.K, np.eye(4), (view.width, view.height))
+    columns, rows, z = projected[np.isfinite(projected[:, 0])].T
     depth = np.full((view.height, view.width), np.nan, np.float32)
     np.fmin.at(depth, (rows.astype(int), columns.astype(int)), z.astype(np.float32))
     return depth
@@ -424,57 +408,49 @@ def from_beside(path: Path, listing: Listing, view: Geometry) -> np.ndarray:
 def photo(
     frame: Frame, listing: Listing, view: Geometry, at: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The view's pixels u8 [H, W, 3] and where they are opaque, bool [H, W]; the whole photo is
-    gone on return.
-    """
+    """The view's pixels u8 [H, W, 3] and the mask of opaque ones [H, W]; frees the whole photo."""
     size = (frame.camera.width, frame.camera.height)
     with open_photo(frame.image, size, listing.upright) as (image, opaque):
-        seen = np.ones(at.shape[1:], bool) if opaque is None else nearest(opaque, at, size)
-        return resampled(image, frame.camera, view, at), seen
+        mask = np.ones(at.shape[1:], bool) if opaque is None else nearest(opaque, at, size)
+        return resampled(image, frame.camera, view, at), mask
 
 
 def variance_kept(image: Any, pixels: np.ndarray, at: np.ndarray) -> float:
-    """Variance of a view's grey values u8 [H, W, 3] in that of the part of its photo which it
-    shows, at most 1: what is finer than its pixels is lost.
+    """Ratio of the variance of a view's grey values u8 [H, W, 3] to that of the part of its photo
+    which it shows, at most 1: detail finer than its pixels is lost.
 
-    Args: at [2, H, W]: where the view's pixels lie in the photo.
+    Args: at [2, H, W]: positions of the view's pixels in the photo.
     Choices: the part is the box about these pixels. A photo of one grey value keeps all.
     """
     inside = np.where(at >= 0, at, np.nan)
     low, high = np.nanmin(inside, (1, 2)), np.nanmax(inside, (1, 2))
     half = (high - low) / np.maximum(2 * np.array(at.shape[:0:-1]) - 2, 1)  # of a pixel of the view
     corners = np.clip([np.floor(low - half), np.ceil(high + half)], 0, image.size).astype(int)
-    part, view = (
-        image.convert("L").crop(corners.ravel().tolist()),
-        Image.fromarray(pixels).convert("L"),
-    )
-    whole, shown = (ImageStat.Stat(of).var[0] for of in (part, view))
-    return min(shown / whole, 1.0) if whole > 0 else 1.0
+    part = image.convert("L").crop(corners.ravel().tolist())
+    view = Image.fromarray(pixels).convert("L")
+    whole, own = (ImageStat.Stat(of).var[0] for of in (part, view))
+    return min(own / whole, 1.0) if whole > 0 else 1.0
 
 
 def within(at: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Where positions [2, H, W] lie in an image of (width, height)."""
+    """Mask of positions [2, H, W] within an image of (width, height)."""
     return np.asarray(((at >= 0) & (at <= np.array(size)[:, None, None])).all(0))
 
 
 def moved(at: np.ndarray, camera: Camera, other: Camera) -> tuple[np.ndarray, tuple[int, int]]:
-    """Positions [2, H, W] of a pinhole camera in another at the same place, and the other's (width,
-    height).
-    """
+    """Positions [2, H, W] of a pinhole camera in another at its centre, and the other's size."""
     (fx, fy, cx, cy), (gx, gy, dx, dy) = camera.pinhole, other.pinhole
     place = np.stack([(at[0] - cx) * (gx / fx) + dx, (at[1] - cy) * (gy / fy) + dy])
     return place, (other.width, other.height)
 
 
 def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.ndarray:
-    """The RGB photo as u8 [H, W, 3] of the view: area averages, where the photo is distorted of its
-    undistorted self.
+    """The view u8 [H, W, 3] of an RGB photo, by area averages, undistorted where a lens bends it.
 
-    Choices: a distorted photo is interpolated, by cubic splines, where it is at least twice as fine
-      as the view: reduced no further, or doubled by its cosine series, which adds and loses
-        nothing. A pixel is the mean of four
-      places in it, each with its share of the area; where pixels are as large as the photo's, the
-      value at its middle.
+    Choices: a distorted photo is interpolated by cubic splines, in an image of at least twice the
+      view's resolution: reduced to no less, or doubled by its cosine series, which is exact. A
+      pixel is the mean of four places in it, one for each quarter of its area; where it is as large
+      as the photo's, the value at its centre.
     """
     if camera.model not in DISTORTED:
         size = (view.width, view.height)

@@ -1,4 +1,4 @@
-"""Cameras and poses of a source: what is usable, and what no photo was ever taken with."""
+"""Cameras and poses of a source, checked for being possible."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from chebsplat.formats.world import World
 from chebsplat.stages.sources.texts import number
 
 # COLMAP's models in the order of their ids: number of parameters
-MODELS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
-          "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
-          "RAD_TAN_THIN_PRISM_FISHEYE": 16, "SIMPLE_DIVISION": 4, "DIVISION": 5, "SIMPLE_FISHEYE": 3, "FISHEYE": 4,
-          "EUCM": 6, "EQUIRECTANGULAR": 2}  # fmt: skip
+MODELS = {
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8,
+    "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12, "RAD_TAN_THIN_PRISM_FISHEYE": 16,
+    "SIMPLE_DIVISION": 4, "DIVISION": 5, "SIMPLE_FISHEYE": 3, "FISHEYE": 4, "EUCM": 6,
+    "EQUIRECTANGULAR": 2,
+}  # fmt: skip
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 EQUIRECTANGULAR = "EQUIRECTANGULAR"  # of a photo of all directions
 DISTORTED = tuple(name for name in MODELS if name not in PINHOLES)
@@ -31,20 +34,19 @@ FOCAL = (0.01, 100.0)  # of the longer side: fields of view of 178 and of 0.6 de
 OFF_CENTRE = 1.5  # sides by which a principal point may lie off the middle: crops have it outside
 # pixels: a lens that moves none by more is not undone, which would cost detail and gain nothing
 LEAST_BENT = 0.05
-LEAST_KEPT = 0.25  # of each side: a distortion that leaves less of a photo is none that a lens has
+LEAST_KEPT = 0.25  # of each side, that a lens's distortion must leave of a photo
 # difference in aspect ratio that still counts as another resolution of the same picture
 SAME_SHAPE = 0.02
 FARTHEST = 1e9  # scene units from the origin: in float64, points that far out are 1e-7 apart
-# units of `formats.world`, between a camera and most others: in float32, points are 0.06 apart
-# there
+# units of `formats.world`, between a camera and most others: float32's spacing is 0.06 there
 WIDEST = 1e6
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A COLMAP camera: model, its parameters in pixels with pixel centres at half integers, and the
-    image's size.
-    turn: degrees to the right that a face of a photo of all directions looks.
+    """A COLMAP camera: model, parameters in pixels with pixel centres at half integers, image size.
+
+    turn: of a face of a photo of all directions, degrees to the right.
     """
 
     model: str
@@ -78,12 +80,12 @@ class Camera:
 
 
 def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) -> Camera:
-    """A camera that can be used. Raises InputError naming the file that describes it."""
+    """A valid camera. Raises InputError naming the file that describes it."""
     if model not in PINHOLES and model not in DISTORTED:
         raise InputError(
             f"{origin}: camera model {model} is not supported "
-            f"({', '.join([*PINHOLES, *DISTORTED])} are); "
-            "make perspective images first, for example with `colmap image_undistorter`"
+            f"({', '.join([*PINHOLES, *DISTORTED])} are); make perspective images first, for "
+            "example with `colmap image_undistorter`"
         )
     try:
         camera = Camera(
@@ -96,8 +98,7 @@ def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) ->
     if wrong := fault(camera):
         raise InputError(
             f"{origin}: camera {model} {camera.width}x{camera.height} {camera.params} is not "
-            f"usable: {wrong}; "
-            "restore the file"
+            f"usable: {wrong}; restore the file"
         )
     if camera.model in DISTORTED and bend(camera) < LEAST_BENT:
         return Camera("PINHOLE", camera.pinhole, camera.width, camera.height)
@@ -106,9 +107,7 @@ def camera_of(origin: Path, model: str, params: Any, width: Any, height: Any) ->
 
 @functools.lru_cache(64)
 def bend(camera: Camera) -> float:
-    """Pixels by which a distorted camera moves a point of the photo at most, looked for on a grid;
-    inf where that cannot be told.
-    """
+    """Largest distortion of a camera, pixels, on a grid over the photo; inf where undefined."""
     fx, fy, cx, cy = camera.pinhole
     x, y = np.meshgrid(np.linspace(0, camera.width, 33), np.linspace(0, camera.height, 33))
     pixels = np.stack([x, y], -1).reshape(-1, 2)
@@ -121,7 +120,7 @@ def bend(camera: Camera) -> float:
 
 
 def fault(camera: Camera) -> str:
-    """What is wrong with a camera; nothing of a usable one."""
+    """Fault of a camera in words; "" of a valid one."""
     width, height = camera.width, camera.height
     if len(camera.params) != MODELS[camera.model]:
         return f"{len(camera.params)} parameters"
@@ -146,20 +145,18 @@ def fault(camera: Camera) -> str:
 
 
 def scaled(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The camera of a photo of (width, height) `size` that was made smaller or larger since the
-    camera was written.
+    """The camera of a photo that was resized to (width, height) `size` after calibration.
 
-    Choices: it stays as it is where the photo has its size, either way up, or another shape, which
-      is no such photo.
+    Choices: unchanged where the photo has the camera's size, either way up, or another shape.
     """
     if (camera.width, camera.height) in (size, size[::-1]):
         return camera
     for width, height in (size, size[::-1]):
         if abs(width * camera.height / (height * camera.width) - 1) < SAME_SHAPE:
-            held = camera.colmap
-            held.rescale(width, height)
+            rescaled = camera.colmap
+            rescaled.rescale(width, height)
             return replace(
-                camera, params=tuple(float(v) for v in held.params), width=width, height=height
+                camera, params=tuple(float(v) for v in rescaled.params), width=width, height=height
             )
     return camera
 
@@ -168,8 +165,8 @@ def scaled(camera: Camera, size: tuple[int, int]) -> Camera:
 def undistorted(camera: Camera) -> Camera:
     """The pinhole camera of the largest view without blank pixels; pinhole cameras as they are.
 
-    Choices: focal lengths stay, and the principal point stays where it is in its pixel, so that
-      where the lens bends little the view's pixels are the photo's.
+    Choices: focal lengths stay, and the principal point moves by whole pixels, so that where the
+      lens bends little the view's pixels are the photo's.
     """
     if camera.model not in DISTORTED:
         return Camera("PINHOLE", camera.pinhole, camera.width, camera.height)
@@ -188,11 +185,9 @@ def undistorted(camera: Camera) -> Camera:
 
 
 def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -> np.ndarray:
-    """Inverse [V, 4, 4] of rigid camera-to-world matrices [V, 4, 4]; nan where one holds inf or
-    nan.
+    """Inverses [V, 4, 4] of rigid camera-to-world matrices [V, 4, 4]; nan of those not finite.
 
-    Raises:  InputError naming the first frame whose matrix is scaled, mirrored, sheared or
-      projective, or far away.
+    Raises:  InputError naming the first frame whose matrix is not rigid, or far away.
     Choices: the rounding of a text file is removed by taking the nearest rotation (SVD).
     """
     usable = np.isfinite(world_from_cam).all((1, 2))
@@ -209,8 +204,7 @@ def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -
     if not rigid.all():
         raise InputError(
             f"{origin}: the pose of {names[int(np.argmin(rigid))]} is not a rotation and a "
-            "translation; "
-            "write poses without scale, shear or mirroring"
+            "translation; write poses without scale, shear or mirroring"
         )
     near(origin, world_from_cam[:, :3, 3], names)
     left, _, right = np.linalg.svd(rotations)
@@ -225,8 +219,8 @@ def cam_from_world(origin: Path, world_from_cam: np.ndarray, names: list[str]) -
 
 
 def near(origin: Path, places: np.ndarray, names: list[str]) -> None:
-    """Raise InputError if one of some cameras' places [V, 3] is beyond FARTHEST, or so far from
-    most of them that no scene can hold both; nan is left to `chosen`.
+    """Raise InputError if a camera's centre, of [V, 3], is beyond FARTHEST, or beyond WIDEST from
+    most others; nan is left to `assembly.choose_frames`.
     """
     reach, inside = (
         np.abs(where).max(1, initial=0) for where in (places, World.of(places).inward(places))
@@ -234,6 +228,6 @@ def near(origin: Path, places: np.ndarray, names: list[str]) -> None:
     for k in np.flatnonzero(np.isfinite(reach) & ((reach > FARTHEST) | (inside > WIDEST))):
         raise InputError(
             f"{origin}: {names[k]} lies {reach[k]:.3g} units from the origin, too far to be told "
-            "from the others "
-            "or to be seen beside them; correct its pose, or move the scene's origin into the scene"
+            "from the others or to be seen beside them; correct its pose, or move the scene's "
+            "origin into the scene"
         )

@@ -1,6 +1,4 @@
-"""The COLMAP source: images/ and models in sparse/, with depth/, label maps and masks/ where they
-are given.
-"""
+"""The COLMAP source: images/ and models in sparse/; optional depth/, label maps and masks/."""
 
 from __future__ import annotations
 
@@ -24,30 +22,30 @@ HELP = (
     "sparse/0/{cameras,images,points3D}.bin or .txt"
 )
 FEW = 10**6  # more than any test_every
-MIN_TRACK = 3  # images that see a point: two can agree by chance
+MIN_TRACK = 3  # images that see a point: two can match by chance
 MAX_ERROR = 4.0  # pixels, of a point's mean reprojection error
-LEAST = 100  # good points; a model with fewer is one whose points somebody has taken away
+LEAST = 100  # good points; from a model with fewer somebody has removed the points
 
 
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
-    """The fields of a capture; `is_test` too, if scene.json says which views are.
+    """The fields of a capture; `is_test` too, if scene.json names test views.
 
     Choices: scene.json's split counts all of its frames, so `max_views` never moves a view from one
-      side to the other; if it leaves one side empty, the split is not given and a note says so. The
-      model's points are taken unless there is depth, which gives more and is held against them
-      (`landmarks`); of those with tracks the ones that fewer than MIN_TRACK images see, or that are
-      known to lie farther than MAX_ERROR pixels off on average, are left out.
+      side to the other; if it leaves one side empty, the split is not used, and a note says so. The
+      model's points are used unless there is depth, which gives more and is checked against them
+      (`landmarks`); points with tracks of fewer than MIN_TRACK images, or with a mean error above
+      MAX_ERROR pixels, are left out.
     """
     listing, model = _listing(folder)
     fields = assembly.assemble(listing, settings, class_names)
     lost = assembly.in_empty_space(model.cloud.means, fields, listing)
-    shown = points_of(
+    points = points_of(
         model.cloud, [common.stem(image.name) for image in model.images], fields, lost
     )
     if "depth" in fields and settings.depth == "auto":
-        fields["landmarks"] = shown
+        fields["landmarks"] = points
     else:
-        fields |= shown
+        fields |= points
     split = _split(folder, [frame.name for frame in listing.frames])
     if split is not None:
         assembly.give_split(fields, split, "scene.json")
@@ -55,9 +53,7 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """Light: reads names only. Depth of one view is a promise: `read` fails if another view of the
-    model has none.
-    """
+    """Reads names only. Where one view has depth, all must: `read` fails otherwise."""
     return {
         "poses": True,
         "depth": any(_pngs(folder / "depth")),
@@ -83,7 +79,7 @@ def files(folder: Path) -> list[Path]:
 
 
 def _pngs(folder: Path) -> Iterator[tuple[str, Path]]:
-    """PNGs below a folder, by the name of the view that they belong to."""
+    """PNGs below a folder, by the name of their view."""
     return (
         (name[:-4], folder / name)
         for name in common.names_below(folder)
@@ -92,19 +88,17 @@ def _pngs(folder: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _models(folder: Path) -> list[Path]:
-    """The folders of all models: sparse/0 and its neighbours, sparse/ itself, and where nerfstudio
-    puts them.
-    """
+    """The folders of all models: in sparse/, sparse/ itself, and nerfstudio's colmap/sparse/."""
     roots = [root for root in (folder / "sparse", folder / "colmap/sparse") if root.is_dir()]
     places = [place for root in roots for place in (*sorted(root.iterdir(), key=_natural), root)]
-    found = [
+    models = [
         p for p in places if any(common.present(p / f"cameras.{end}") for end in ("bin", "txt"))
     ]
-    if not found:
+    if not models:
         raise InputError(
             f"{folder / 'sparse/0'} holds no COLMAP model (cameras.bin or cameras.txt); {HELP}"
         )
-    return found
+    return models
 
 
 def _natural(path: Path) -> Any:
@@ -112,20 +106,18 @@ def _natural(path: Path) -> Any:
 
 
 def _model_folder(folder: Path) -> tuple[Path, list[str]]:
-    """The model with the most images, the first of equals; a note that names the others, if there
-    are any.
-    """
+    """The model with the most images, the first of equals; a note that names any others."""
     places = _models(folder)
     if len(places) == 1:
         return places[0], []
     sizes = [size_of(place) for place in places]
     best = sizes.index(max(sizes))
-    told = [
+    entries = [
         f"{place.relative_to(folder)} ({size} images)"
         for place, size in zip(places, sizes, strict=True)
     ]
-    others = ", ".join(told[:best] + told[best + 1 :])
-    return places[best], [f"The largest model is taken, {told[best]}; left out: {others}."]
+    others = ", ".join(entries[:best] + entries[best + 1 :])
+    return places[best], [f"The largest model is taken, {entries[best]}; left out: {others}."]
 
 
 def _document(folder: Path) -> dict[str, Any]:
@@ -134,9 +126,7 @@ def _document(folder: Path) -> dict[str, Any]:
 
 
 def _split(folder: Path, names: list[str]) -> set[str] | None:
-    """Names of the test views: every `test_every`-th frame of scene.json, from its first on; None
-    if it has no say.
-    """
+    """Names of the test views: every `test_every`-th frame of scene.json, if it has that key."""
     document = _document(folder)
     if "test_every" not in document:
         return None
@@ -154,12 +144,10 @@ def _split(folder: Path, names: list[str]) -> set[str] | None:
 def points_of(
     cloud: Cloud, images: list[str], fields: dict[str, Any], lost: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """points, point_colors and tracks (point, view) of a capture of these fields; nothing of few
-    points.
+    """points, point_colors and tracks (point, view) of a capture of these fields, unless too few.
 
-    Args:    images: names of the views that the cloud's tracks count; lost: points that are left
-      out.
-    Choices: a point whose error is not known is taken.
+    Args:    images: names of the views that the cloud's tracks count; lost: mask of points to drop.
+    Choices: a point without an error is used.
     """
     names, notes = fields["names"], fields["source"]["notes"]
     within = World.of(centers(fields["cam_from_world"])).inward(cloud.means)
@@ -170,8 +158,7 @@ def points_of(
     if not good.all():
         notes.append(
             f"{len(good) - good.sum()} of the model's {len(good)} points are left out: fewer than "
-            f"{MIN_TRACK} images "
-            f"see them, or they lie more than {MAX_ERROR:g} pixels off."
+            f"{MIN_TRACK} images see them, or they lie more than {MAX_ERROR:g} pixels off."
         )
     good &= True if lost is None else ~lost
     if good.sum() < LEAST:
@@ -186,12 +173,12 @@ def points_of(
         [[view.get(each, -1) for each in (name, *assembly.face_names(name))] for name in images]
     )
     of_point = np.where(good, np.cumsum(good) - 1, -1)
-    # of each track, of which one sees the point
+    # of each track's photo: the rows of its faces, of which the one with the point ahead counts
     rows = of_image.reshape(len(images), -1)[cloud.tracks[:, 1]]
     ahead = np.concatenate([fields["cam_from_world"][:, 2], np.zeros((1, 4))])[rows]
     depth = np.einsum("trk,tk->tr", ahead[..., :3], cloud.means[cloud.tracks[:, 0]]) + ahead[..., 3]
-    seen = np.take_along_axis(rows, np.where(rows < 0, -np.inf, depth).argmax(1)[:, None], 1)[:, 0]
-    tracks = np.stack([of_point[cloud.tracks[:, 0]], seen], 1)
+    views = np.take_along_axis(rows, np.where(rows < 0, -np.inf, depth).argmax(1)[:, None], 1)[:, 0]
+    tracks = np.stack([of_point[cloud.tracks[:, 0]], views], 1)
     return {
         "points": cloud.means[good],
         "point_colors": cloud.colors[good],
@@ -200,9 +187,7 @@ def points_of(
 
 
 def _listing(folder: Path) -> tuple[Listing, Model]:
-    """The frames, and the model with its images called by their files; those that are absent have
-    no name.
-    """
+    """The frames, and the model with its images named by their files, "" where absent."""
     place, notes = _model_folder(folder)
     images = common.photo_folder(folder)
     if not images.is_dir() and (
@@ -214,8 +199,8 @@ def _listing(folder: Path) -> tuple[Listing, Model]:
         )
     model = read_model(place)
     notes += model.notes
-    on_disk, wanted = common.images_in(images), [image.name for image in model.images]
-    files = common.matched(wanted, on_disk)
+    on_disk, listed = common.images_in(images), [image.name for image in model.images]
+    files = common.matched(listed, on_disk)
     pngs = dict(_pngs(folder / "depth"))
     masks, unmasked = common.masks_in(folder, files.values())
     frames = []
@@ -237,10 +222,10 @@ def _listing(folder: Path) -> tuple[Listing, Model]:
                 )
             )
     rest = set(on_disk) - set(files.values())
-    absent = [name for name in wanted if name not in files]
+    absent = [name for name in listed if name not in files]
     if absent:
         notes.append(
-            f"{len(absent)} of {len(wanted)} images of the model are absent on disk "
+            f"{len(absent)} of {len(listed)} images of the model are absent on disk "
             f"({few(absent)})."
         )
     if rest:

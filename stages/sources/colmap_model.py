@@ -1,8 +1,7 @@
-"""COLMAP's models, binary and text: cameras, posed images and points, read by their documented
-layout.
+"""Reader of COLMAP's models, binary and text: cameras, posed images and points.
 
-They are read here and not by pycolmap, which loops for ever over a file that is cut in the middle
-of a record, and takes all memory for a name without an end.
+pycolmap's own loops for ever over a file that is cut in the middle of a record, and fills all
+memory at a name without an end.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from chebsplat.stages.sources.texts import LONGEST
 
 LARGEST = 512 << 20  # bytes of a file: a million images, or five million points
 AGAIN = "copy it again"
-SHORT = 0.01  # of a quaternion's length: what few decimals take from it
+SHORT = 0.01  # of a quaternion's length: error by few decimals
 
 
 @dataclass(frozen=True)
@@ -37,8 +36,8 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """A model's points: means f64 [N, 3], colors u8 [N, 3], errors f64 [N] pixels; tracks i64 [T,
-    2]: (point's row, position in the model's images).
+    """A model's points: means f64 [N, 3], colors u8 [N, 3], errors f64 [N] pixels; tracks i64
+    [T, 2]: (point's row, position in the model's images).
     """
 
     means: np.ndarray
@@ -50,8 +49,7 @@ class Cloud:
 @dataclass(frozen=True, eq=False)
 class Model:
     """origin: the cameras' file; cameras: (model, parameters, width, height) by id; images in the
-    file's order;
-    notes: what of the files was not read.
+    file's order; notes: on parts of the files that were not read.
     """
 
     origin: Path
@@ -62,9 +60,7 @@ class Model:
 
 
 def size_of(place: Path) -> int:
-    """How many images the model in a folder has, by what its files say; 0 of what cannot be
-    read.
-    """
+    """Number of images that the files of a model state; 0 where they cannot be read."""
     try:
         if common.present(place / "images.bin"):
             regular(place / "images.bin")
@@ -76,9 +72,7 @@ def size_of(place: Path) -> int:
 
 
 def read_model(place: Path) -> Model:
-    """The model in a folder. Raises InputError naming the file that is cut, inconsistent or no
-    model's.
-    """
+    """The model in a folder. Raises InputError naming the file that is cut or inconsistent."""
     end = "bin" if common.present(place / "cameras.bin") else "txt"
     paths = [place / f"{name}.{end}" for name in ("cameras", "images", "points3D")]
     for path in paths:
@@ -86,19 +80,19 @@ def read_model(place: Path) -> Model:
     read: Any = (_text_cameras, _text_images, _text_points)
     if end == "bin":
         read = (_binary_cameras, _binary_images, _binary_points)
-    found: list[list[Any]] = []
+    parts: list[list[Any]] = []
     notes: list[str] = []
     for path, entries in zip(paths, read, strict=True):
         try:
-            found.append(list(entries(path, notes)))
+            parts.append(list(entries(path, notes)))
         except (ValueError, IndexError, OverflowError, struct.error) as error:
             raise InputError(
                 f"{path} is cut or no COLMAP model ({str(error)[:LONGEST]}); {AGAIN}"
             ) from None
-    known = dict(found[0])
+    by_id = dict(parts[0])
     images = []
-    for _, name, camera, quaternion, translation in found[1]:
-        if camera not in known:
+    for _, name, camera, quaternion, translation in parts[1]:
+        if camera not in by_id:
             raise InputError(
                 f"{paths[1]}: {name[:LONGEST]!r} is of camera {camera}, which is not "
                 f"listed; {AGAIN}"
@@ -109,22 +103,20 @@ def read_model(place: Path) -> Model:
         np.array([image.pose[:3, 3] for image in images]).reshape(-1, 3),
         [i.name for i in images],
     )
-    position = {key: row for row, (key, *_) in enumerate(found[1])}
-    return Model(paths[0], known, images, _cloud(paths[2], found[2], position), tuple(notes))
+    position = {key: row for row, (key, *_) in enumerate(parts[1])}
+    return Model(paths[0], by_id, images, _cloud(paths[2], parts[2], position), tuple(notes))
 
 
 def _cloud(path: Path, entries: list[Any], position: dict[int, int]) -> Cloud:
     """Points from (x, y, z, red, green, blue, error) and the ids of the images that see each.
 
-    Choices: an image that is not listed is passed over: scripts that thin out a model leave its
-      points as they are.
+    Choices: an image that is not listed is ignored: scripts that thin out a model leave its points
+      as they are.
     """
     values = np.array([entry[0] for entry in entries], float).reshape(-1, 7)
-    seen = [np.asarray(entry[1], np.int64) for entry in entries]
-    ids, row = (
-        np.concatenate([*seen, np.zeros(0, np.int64)]),
-        np.repeat(np.arange(len(seen)), [*map(len, seen)]),
-    )
+    image_ids = [np.asarray(entry[1], np.int64) for entry in entries]
+    ids = np.concatenate([*image_ids, np.zeros(0, np.int64)])
+    row = np.repeat(np.arange(len(image_ids)), [*map(len, image_ids)])
     if (
         not np.isfinite(values[:, :6]).all()
         or ((values[:, 3:6] < 0) | (values[:, 3:6] > 255)).any()
@@ -138,8 +130,7 @@ def _cloud(path: Path, entries: list[Any], position: dict[int, int]) -> Cloud:
 def _pose(path: Path, name: str, quaternion: Any, translation: Any) -> np.ndarray:
     """cam_from_world [4, 4] of a quaternion (w, x, y, z) and a translation.
 
-    Choices: a quaternion of unit length is taken as it is, as COLMAP does; one of few decimals is
-      normalised.
+    Choices: a unit quaternion is used as it is, as COLMAP does; one of few decimals is normalised.
     """
     q, t = np.array(quaternion, float), np.array(translation, float)
     off = abs(math.hypot(*q) - 1)
@@ -159,9 +150,7 @@ def _pose(path: Path, name: str, quaternion: Any, translation: Any) -> np.ndarra
 
 
 class _Bytes:
-    """A binary file from its first byte on; ends in ValueError where a record would pass the last
-    one.
-    """
+    """A binary file, read record by record; ValueError where a record would pass its end."""
 
     def __init__(self, path: Path):
         if regular(path).st_size > LARGEST:
@@ -169,9 +158,9 @@ class _Bytes:
         self.path, self.data, self.at = path, path.read_bytes(), 0
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:
-        found = layout.unpack_from(self.data, self.at)
+        values = layout.unpack_from(self.data, self.at)
         self.at += layout.size
-        return found
+        return values
 
     def skip(self, n_bytes: int) -> None:
         self.at += n_bytes
@@ -180,19 +169,19 @@ class _Bytes:
 
     def word(self) -> str:
         end = self.data.index(b"\0", self.at)  # raises ValueError
-        found = self.data[self.at : end].decode(errors="surrogateescape")
+        text = self.data[self.at : end].decode(errors="surrogateescape")
         self.at = end + 1
-        return found
+        return text
 
     def count(self, least: int) -> range:
-        """As many as the file says there are, of at least so many bytes each."""
+        """A range of the next count in the file, of records of at least so many bytes."""
         (n,) = self.take(_COUNT)
         if n * least > len(self.data) - self.at:
             raise ValueError(f"it counts {n} records in {len(self.data)} bytes")
         return range(n)
 
     def end(self, notes: list[str]) -> None:
-        """Note bytes beyond the last record, which COLMAP passes over, too."""
+        """Note bytes beyond the last record, which COLMAP ignores, too."""
         if rest := len(self.data) - self.at:
             notes.append(
                 f"{rest} bytes follow the last record of {self.path.name} and are not read."
@@ -240,7 +229,7 @@ def _binary_points(path: Path, notes: list[str]) -> Iterator[tuple[tuple[float, 
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Each line and its number, without what surrounds it; comments are left out."""
+    """Stripped lines with their numbers, without comments."""
     for number, line in enumerate(read_text(path, AGAIN, largest=LARGEST // 8).splitlines(), 1):
         if not (bare := line.strip()).startswith("#"):
             yield number, bare
@@ -271,8 +260,8 @@ def _text_images(
     """Images, each followed by a line of its keypoints.
 
     Choices: the line after an image lists its keypoints if it is empty or of numbers alone, three
-      each; scripts that thin out a model leave it away, and a line that reads as an image is one.
-      Anything else is refused.
+      each; scripts that thin out a model omit it, so a line that reads as an image is one. Anything
+      else is an error.
     """
     follows = False
     for number, line in _lines(path):
@@ -294,7 +283,7 @@ def _text_images(
 
 
 def _numbers(line: str) -> int | None:
-    """How many numbers a line holds; None where it holds something else, too."""
+    """Number of numbers in a line; None where it holds anything else."""
     try:
         return len([float(word) for word in line.split()])
     except ValueError:

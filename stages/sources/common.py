@@ -1,6 +1,4 @@
-"""What every source on disk shares: frames as a listing, the files behind them, and which kind a
-folder is.
-"""
+"""Shared parts of sources on disk: listings of frames, their files, detection of the kind."""
 
 from __future__ import annotations
 
@@ -23,7 +21,7 @@ from chebsplat.formats.videos import is_video
 from chebsplat.stages.settings import SourceSection
 from chebsplat.stages.sources.cameras import Camera
 
-# where label maps lie; the first that is there is read
+# folders of label maps; the first that exists is read
 LABELS = (
     "semantic",
     "semantics",
@@ -33,7 +31,7 @@ LABELS = (
     "segmentation",
     "segmentations",
 )
-# folders of what belongs to photos, or is made of them
+# folders of images that are no photos
 BESIDE = {
     "masks",
     "mask",
@@ -48,22 +46,17 @@ BESIDE = {
 }
 LabelFile = Path | dict[str, Path]  # a view's map, or its masks by class
 ENDING = re.compile(r"\.[a-zA-Z]\w{1,4}$")  # of an image's name
-# What cameras leave beside photos, or instead of them, and what makes JPEGs of it.
-UNREAD = (
-    dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), "darktable-cli a{0} "
-                                                                                    ""
-                                                                                    ""
-                                                                                    "a.jpg")
-    | dict.fromkeys((".avif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".jp2", ".jxl", ".exr", ".psd"),
-                    "magick a{0} a.jpg")
-)  # fmt: skip
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+PICTURES = (".avif", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".jp2", ".jxl", ".exr", ".psd")
+# suffixes of images that are not read: the command that makes JPEGs of them
+UNREAD = dict.fromkeys(RAW, "darktable-cli a{0} a.jpg") | dict.fromkeys(
+    PICTURES, "magick a{0} a.jpg"
+)
 
 
 @dataclass
 class Frame:
-    """One photo and what belongs to it. pose: cam_from_world [4, 4], OpenCV axes, nan if unusable;
-    None if unknown.
-    """
+    """A photo and its files. pose: cam_from_world [4, 4], OpenCV axes; nan invalid; or None."""
 
     name: str
     image: Path
@@ -73,15 +66,14 @@ class Frame:
     labels: LabelFile | None = None
     mask: Path | None = None
     objects: Path | None = None  # ids of objects, as large as the labels
-    pseudo_labels: Path | None = None  # what a 2D network took the photo for
-    confidence: Path | None = None  # .npz whose `confidence` [h, w] says how sure it was
-    sureness: Path | None = None  # 0 where the depth is not to be believed, as a LiDAR says
+    pseudo_labels: Path | None = None  # of a 2D network
+    confidence: Path | None = None  # .npz with the pseudo labels' `confidence` [h, w]
+    sureness: Path | None = None  # a LiDAR's confidence in its depth, 0: invalid
 
 
 class Shot(NamedTuple):
-    """A photo that comes alone. size: (width, height), upright; focal: 35 mm equivalent, where EXIF
-    says one;
-    panorama: whether it shows all directions; frame: its number in a video.
+    """A photo without pose. size: (width, height), upright; focal: 35 mm equivalent, by EXIF;
+    panorama: true if of all directions; frame: its number in a video.
     """
 
     name: str
@@ -93,7 +85,7 @@ class Shot(NamedTuple):
     frame: int = 0
 
     def reduced(self, max_side: int) -> tuple[int, int]:
-        """The (width, height) that no side of exceeds so many pixels."""
+        """(width, height), reduced until no side exceeds `max_side`."""
         factor = min(1.0, max_side / max(self.size))
         return max(round(self.size[0] * factor), 1), max(round(self.size[1] * factor), 1)
 
@@ -102,15 +94,14 @@ class Shot(NamedTuple):
 class Listing:
     """All frames of a source.
 
-    label_names:  by raw id; label_place: the folder of their maps; label_kinds: what these were
-      taken for, by view,
-                  once they are read (`labels.read`). class_names: all classes in order; None: those
-                    that occur.
+    label_names:  by raw id; label_place: the folder of their maps; label_kinds: of the maps, by
+                  view, once read (`labels.read`).
+    class_names:  all classes in order; None: those that occur.
     corrections:  object id -> raw id of the label that its pixels take instead.
     pseudo_names: by id in the pseudo labels; 0 is none.
     depth_scale:  stored units in one scene unit; no_depth: stored values that mean "unknown".
     depth_camera: a pinhole camera of the depth images; None: the photo's own.
-    depth_offset: where it stands in the photo's camera [3], scene units; None: at its centre.
+    depth_offset: its centre in the photo's camera [3], scene units; None: the same centre.
     """
 
     kind: str
@@ -122,31 +113,34 @@ class Listing:
     corrections: dict[int, int] = field(default_factory=dict)
     pseudo_names: dict[int, str] | None = None
     depth_scale: float = 1000.0
-    no_depth: tuple[int, ...] = (0, 65_535)  # none, and what 16 bits hold no more of
+    no_depth: tuple[int, ...] = (0, 65_535)  # none, and beyond 16 bits
     depth_camera: Camera | None = None
     depth_offset: np.ndarray | None = None
     notes: list[str] = field(default_factory=list)
-    # by view, where its photo is transparent, once read
+    # by view: mask of transparent pixels of its photo, once read
     empty: dict[str, np.ndarray] = field(default_factory=dict)
-    # turn every image by its EXIF orientation; otherwise only where its camera asks for it
+    # turn every image by its EXIF orientation; otherwise only those that fit their camera so
     upright: bool = False
 
     def has(self, what: str) -> bool:
-        """Whether every frame has a "pose", "depth", "labels" and so on."""
+        """True where every frame has a "pose", "depth", "labels" and so on."""
         return bool(self.frames) and all(getattr(frame, what) is not None for frame in self.frames)
 
 
 def sureness(depth: Path) -> Path | None:
-    """What says where a LiDAR's depth is sure, if there is any: confidence/ beside its folder."""
+    """A LiDAR's confidence in a depth map, in confidence/ beside its folder, if there is one."""
     path = depth.parent.with_name("confidence") / depth.name
     return path if depth.parent.name.startswith("depth") and present(path) else None
 
 
 def file_of(view: int) -> str:
-    """The image of a view in the scratch folder: pycolmap's lists of pairs allow no name with a
-    space.
-    """
+    """A view's image in the scratch folder: pycolmap's lists of pairs allow no spaces in names."""
     return f"{view:06d}.png"
+
+
+def is_photo(path: Path, root: Path) -> bool:
+    """True for an image below a source's folder that is by its path no mask, depth or label map."""
+    return BESIDE.isdisjoint(re.findall("[a-z]+", str(path.relative_to(root)).lower()))
 
 
 def stem(name: str) -> str:
@@ -163,22 +157,18 @@ def distinct(named: Iterable[tuple[str, Path]]) -> None:
 
 
 def present(path: Path) -> bool:
-    """Whether there is anything of that name: a pipe or a dangling link is refused when it is read,
-    not passed over.
-    """
+    """True where anything of that name exists: a pipe or a dangling link fails when it is read."""
     return os.path.lexists(path)
 
 
 def nearest_file(folder: Path, name: str) -> Path | None:
-    """A file that many scenes share: in the scene's folder or in one of the two above it."""
+    """A file shared by scenes: in the scene's folder or in one of the two above it."""
     places = (folder, *folder.absolute().parents[:2])
     return next((place / name for place in places if present(place / name)), None)
 
 
 def detect(folder: Path) -> str:
-    """The kind of source that a folder, or a file of video, is. Raises InputError naming what was
-    looked for.
-    """
+    """Kind of source of a folder, or of a file of video. Raises InputError naming all signs."""
     if any(present(folder / f"transforms{part}.json") for part in ("", "_train")):
         return "transforms"
     if any(present(folder / part) for part in ("traj.txt", "Sequence_1", "results")):
@@ -212,17 +202,13 @@ def detect(folder: Path) -> str:
         raise InputError(f"{folder} holds no .jpg, .png or .heic photo: {others}")
     raise InputError(
         f"{folder} is no source: it holds neither transforms.json, traj.txt, results/, "
-        "Sequence_1/, "
-        "color/ with pose/ and intrinsic/, frame-*.color.jpg or .png, sparse/0/cameras.bin or "
-        ".txt, "
-        f"nor a .jpg, .png or .heic photo, nor one video"
+        "Sequence_1/, color/ with pose/ and intrinsic/, frame-*.color.jpg or .png, "
+        "sparse/0/cameras.bin or .txt, nor a .jpg, .png or .heic photo, nor one video"
     )
 
 
 def unread(folder: Path) -> str:
-    """What else a folder and its images/ hold that may be taken for photos, counted by suffix;
-    nothing of none.
-    """
+    """Unsupported images in a folder and its images/ by suffix, with a remedy; "" if none."""
     places = [place for place in (folder, folder / "images") if place.is_dir()]
     ends = [
         os.path.splitext(name)[1].lower()
@@ -241,10 +227,9 @@ def unread(folder: Path) -> str:
 
 
 def names_below(folder: Path) -> Iterator[str]:
-    """Relative POSIX paths of the images below a folder, in no order; none if it does not exist.
-    InputError.
+    """Relative POSIX paths of the images below a folder, unordered; none if it does not exist.
 
-    Choices: a folder that is called like an image counts as one, so that reading it says so.
+    Choices: a folder named like an image counts as one, so that reading it reports it.
     """
     for place, folders, names in os.walk(folder):
         inner = os.path.relpath(place, folder).replace(os.sep, "/")
@@ -255,9 +240,7 @@ def names_below(folder: Path) -> Iterator[str]:
 
 
 def printable(place: str | Path, names: Iterable[str]) -> Iterator[str]:
-    """Names of files, which become names of views. Raises InputError on bytes that are no UTF-8,
-    and on newlines.
-    """
+    """The names of files. Raises InputError on bytes that are no UTF-8 and on newlines."""
     for name in names:
         if unprintable(name):
             raise InputError(
@@ -271,16 +254,14 @@ def images_in(folder: Path) -> list[str]:
     """As `names_below`, in natural order. Raises InputError if there are none."""
     if not folder.is_dir():
         raise InputError(f"{folder} is missing; the source needs its images there")
-    found = sorted(names_below(folder), key=natural)
-    if not found:
+    names = sorted(names_below(folder), key=natural)
+    if not names:
         raise InputError(f"{folder} holds no .jpg, .png or .heic image; correct source.path")
-    return found
+    return names
 
 
 def photo_folder(folder: Path) -> Path:
-    """Where a source's photos lie: images/, or what 3DGS' converter reads, or a reduced copy that
-    stands alone.
-    """
+    """Folder of a source's photos: images/, input/ of 3DGS' converter, or a reduced copy."""
     places = [folder / name for name in ("images", "input", "images_2", "images_4", "images_8")]
     return next((place for place in places if any(names_below(place))), places[0])
 
@@ -298,20 +279,18 @@ def with_photos(folder: Path) -> list[str]:
     )
 
 
-def matched(wanted: Sequence[str], there: Collection[str]) -> dict[str, str]:
-    """The file that each of the names which a model holds means; names that mean none are left
-    away.
+def matched(listed: Sequence[str], there: Collection[str]) -> dict[str, str]:
+    """Files by the names that a model lists; names without a file are omitted.
 
     Args: there: POSIX paths of files below the folder that the names are relative to.
-    Choices: a name is a path with either separator. Where that is no file, endings are left away,
-      and then folders, one by one from the front, until it is one file's alone, and no other
-      name's.
+    Choices: a name is a path with either separator. Where that is no file, endings are dropped, and
+      then folders, one by one from the front, until it fits one file alone, and no other name does.
     """
     files = set(there)
-    found = {name: path for name in wanted if (path := name.replace("\\", "/")) in files}
+    matches = {name: path for name in listed if (path := name.replace("\\", "/")) in files}
     for depth in range(1 + max((name.count("/") for name in files), default=0), 0, -1):
         places: list[dict[tuple[str, ...], list[str]]] = []
-        for names in (set(wanted) - set(found), files - set(found.values())):
+        for names in (set(listed) - set(matches), files - set(matches.values())):
             places.append({})
             for name in names:
                 parts = tuple(ENDING.sub("", name.replace("\\", "/")).casefold().split("/"))
@@ -319,21 +298,19 @@ def matched(wanted: Sequence[str], there: Collection[str]) -> dict[str, str]:
                     places[-1].setdefault(parts[-depth:], []).append(name)
         for key, names_of in places[0].items():
             if len(names_of) == len(places[1].get(key, ())) == 1:
-                found[names_of[0]] = places[1][key][0]
-    return found
+                matches[names_of[0]] = places[1][key][0]
+    return matches
 
 
 def masks_in(folder: Path, names: Iterable[str]) -> tuple[dict[str, Path], list[str]]:
-    """The masks of photos by the photos' names, in masks/ and called like a photo or its stem; a
-    note if some lack.
-    """
-    held = {stem(name): folder / "masks" / name for name in names_below(folder / "masks")}
-    given = list(names)
-    found = {name: path for name in given if (path := held.get(name) or held.get(stem(name)))}
-    lacking = len(given) - len(found)
-    return found, [
-        f"{lacking} of {len(given)} views have no mask; all their pixels count."
-    ] if held and lacking else []
+    """Masks by photo, in masks/ and named like it or its stem; a note if some photos have none."""
+    masks = {stem(name): folder / "masks" / name for name in names_below(folder / "masks")}
+    photos = list(names)
+    matches = {name: path for name in photos if (path := masks.get(name) or masks.get(stem(name)))}
+    lacking = len(photos) - len(matches)
+    return matches, [
+        f"{lacking} of {len(photos)} views have no mask; all their pixels count."
+    ] if masks and lacking else []
 
 
 def spellings(name: str) -> tuple[str, str]:
@@ -343,11 +320,9 @@ def spellings(name: str) -> tuple[str, str]:
 
 
 def resolve_source(name: str, source: SourceSection) -> SourceSection:
-    """The source really meant: `named` is Replica's scene where REPLICA_ROOT holds it, else the
-    generated one.
+    """The source, `named` resolved: Replica's scene if REPLICA_ROOT has it, else a generated one.
 
-    The result, not `named`, enters an artifact's key, so the two can never be mistaken for each
-    other.
+    The resolved source enters an artifact's key, so that the two are never confused.
     """
     if source.kind == "named":
         root = os.environ.get("REPLICA_ROOT")

@@ -1,8 +1,8 @@
-"""Depth that a source brings, held against its poses: in their unit, another, or none.
+"""Unit of a source's depth, checked against its poses and fitted where it is another.
 
 Tools write depth in millimetres beside poses in a reconstruction's own unit, in parts of 5000, or
 as a network's inverse depth. One scale, or one scale and shift of inverse depth, puts the surface
-where a source's points, or other views, have it; depth that is there already is left as it is.
+where a source's points, or other views, have it; depth that agrees is left as it is.
 """
 
 from __future__ import annotations
@@ -20,27 +20,25 @@ from chebsplat.errors import DataFailure
 
 N_PAIRS, N_PIXELS = 300, 20  # pairs of views whose depths are compared, and pixels of each
 NEAREST = 0.25  # of the views, among which the other of a pair is drawn: it should see the same
-N_POINTS = 100_000  # pairs of a point and a view that are looked at
-# such pixels, without which nothing is said, and the share of them that a unit must compare
+N_POINTS = 100_000  # pairs of a point and a view that are compared
+# such pixels that a verdict needs, and the share of them that a unit must compare
 LEAST, COMPARED = 500, 0.1
 SAME = 0.03  # of its depth, within which two depths agree
 # of the share that agrees in the best unit: depth of which so many agree as it is stays so
 FITS = 0.95
 # that must agree in some unit; and their odds over those at the ends of all units
 LEAST_SHARE, OVER_CHANCE = 0.25, 3.0
-BASELINES = 0.03, 100.0  # between the distances of cameras, how far what they see may lie
-DOUBTED = 0.5  # share below which a note says how many agree
+BASELINES = 0.03, 100.0  # range of depth, in distances of cameras
+DOUBTED = 0.5  # share that agrees, below which there is a note
 INVERSE = 1.1  # times the share that agrees in any unit, which inverse depth needs
 # ln of far to near of inverse depth: less is a wall, whose depth any unit fits from afar
 LEAST_RATIO = 0.4
-# times what the rest holds, and share of pixels, that make a value a code for unknown
-FAR, HELD = 2.0, 1e-3
+# times the range of all others, and share of pixels, that make a value a code for unknown
+FAR, FREQUENT = 2.0, 1e-3
 
 
 class Unit(NamedTuple):
-    """What stored depth v stands for: z = slope v, or, of inverse depth, 1 / z = slope v + shift;
-    scene units.
-    """
+    """A unit of stored depth v: z = slope v, or, of inverse depth, 1 / z = slope v + shift."""
 
     slope: float
     shift: float = 0.0
@@ -55,38 +53,36 @@ class Unit(NamedTuple):
 
 
 class Evidence(Protocol):
-    """Stored depths [N] that can be compared, and between which depths in scene units they must
-    lie.
-    """
+    """Stored depths [N] that can be compared, and their range in scene units."""
 
     stored: np.ndarray
     between: tuple[float, float]
 
     def misses(self, unit: Unit) -> np.ndarray:
-        """|z / z' - 1| of the pixels that can be compared if depth is in this unit, at most N."""
+        """|z / z' - 1| of the pixels that can be compared in this unit, at most N."""
 
 
 class AtPoints:
-    """Depth at pixels where the source's points lie; those that are hidden there miss it.
+    """Depth at the pixels of the source's points, against these; occluded ones disagree.
 
-    Args: points [P, 3] scene units; tracks [T, 2] (point, view), who sees them; none: every view
-      that has them inside.
+    Args: points [P, 3] scene units; tracks [T, 2] (point, view); none: every view that has the
+      point inside.
     """
 
     def __init__(self, fields: dict[str, Any], points: np.ndarray, tracks: np.ndarray) -> None:
         n_views, height, width = fields["depth"].shape
         rng, count = np.random.default_rng(0), len(tracks) or len(points) * n_views
-        chosen = np.arange(count) if count <= N_POINTS else rng.integers(0, count, N_POINTS)
-        point, view = tracks[chosen].T if len(tracks) else (chosen // n_views, chosen % n_views)
+        pairs = np.arange(count) if count <= N_POINTS else rng.integers(0, count, N_POINTS)
+        point, view = tracks[pairs].T if len(tracks) else (pairs // n_views, pairs % n_views)
         poses = fields["cam_from_world"][view]
         at = (
             np.einsum("nij,nj->ni", poses[:, :3, :3], points[point].astype(np.float64))
             + poses[:, :3, 3]
         )
-        pixels, inside = seen(at, fields["Ks"][view], (width, height))
+        pixels, inside = project_into(at, fields["Ks"][view], (width, height))
         stored = fields["depth"][view[inside], pixels[:, 1], pixels[:, 0]]
-        known = stored > 0  # nan is unknown
-        self.stored, self.z = stored[known].astype(np.float64), at[inside, 2][known]
+        valid = stored > 0  # nan is unknown
+        self.stored, self.z = stored[valid].astype(np.float64), at[inside, 2][valid]
         low, high = np.quantile(self.z, (0.001, 0.999)) if len(self.z) else (1.0, 1.0)
         self.between = float(low), float(high)
 
@@ -95,7 +91,7 @@ class AtPoints:
 
 
 class BetweenViews:
-    """Pixels of one view where another view sees them."""
+    """Depth at pixels of one view against another view's there."""
 
     def __init__(self, fields: dict[str, Any]) -> None:
         self.depth = fields["depth"]
@@ -104,17 +100,15 @@ class BetweenViews:
         eyes, axes = centers(poses), poses[:, 2, :3]
         away = cdist(eyes, eyes)
         away = away / max(float(np.median(away)), 1e-30) + np.arccos((axes @ axes.T).clip(-1, 1))
-        one, rank = (
-            rng.integers(0, n_views, N_PAIRS),
-            rng.integers(1, max(int(NEAREST * n_views), 4), N_PAIRS),
-        )
+        one = rng.integers(0, n_views, N_PAIRS)
+        rank = rng.integers(1, max(int(NEAREST * n_views), 4), N_PAIRS)
         two = np.argsort(away, axis=1)[one, rank % n_views]
         one, self.other = np.repeat([one, two], N_PIXELS, axis=1)
         column, row = (rng.integers(0, side, len(one)) for side in (width, height))
         self.stored = self.depth[one, row, column].astype(np.float64)
-        kept = (one != self.other) & (self.stored > 0)
-        one, self.other, self.stored = one[kept], self.other[kept], self.stored[kept]
-        image = np.stack([column[kept] + 0.5, row[kept] + 0.5, np.ones(len(one))], 1)
+        usable = (one != self.other) & (self.stored > 0)
+        one, self.other, self.stored = one[usable], self.other[usable], self.stored[usable]
+        image = np.stack([column[usable] + 0.5, row[usable] + 0.5, np.ones(len(one))], 1)
         motions = poses[self.other] @ np.linalg.inv(poses)[one]
         self.rays = np.einsum("nij,njk,nk->ni", motions[:, :3, :3], np.linalg.inv(Ks)[one], image)
         self.offsets, self.Ks = motions[:, :3, 3], Ks[self.other]
@@ -124,15 +118,17 @@ class BetweenViews:
     def misses(self, unit: Unit) -> np.ndarray:
         at = unit.depth(self.stored)[:, None] * self.rays + self.offsets
         height, width = self.depth.shape[1:]
-        pixels, inside = seen(at, self.Ks, (width, height))
+        pixels, inside = project_into(at, self.Ks, (width, height))
         there = self.depth[self.other[inside], pixels[:, 1], pixels[:, 0]].astype(np.float64)
-        known = there > 0
-        return np.asarray(np.abs(unit.depth(there[known]) / at[inside, 2][known] - 1))
+        valid = there > 0
+        return np.asarray(np.abs(unit.depth(there[valid]) / at[inside, 2][valid] - 1))
 
 
-def seen(at: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels i64 [M, 2] (column, row) of those places [N, 3] of cameras [N, 3, 3] that lie in an
-    image of this (width, height), and which these are, bool [N].
+def project_into(
+    at: np.ndarray, Ks: np.ndarray, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels i64 [M, 2] (column, row) of those points [N, 3] of cameras [N, 3, 3] that lie in an
+    image of this (width, height), and their mask [N].
     """
     image = np.einsum("nij,nj->ni", Ks, at)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -142,18 +138,17 @@ def seen(at: np.ndarray, Ks: np.ndarray, size: tuple[int, int]) -> tuple[np.ndar
 
 
 def fit(fields: dict[str, Any], where: Path) -> None:
-    """Bring the depth of a capture's fields into the unit of its poses, and say so in its notes.
+    """Bring the depth of a capture's fields into the unit of its poses, with a note.
 
-    Args: where: the source's folder. Fields: `landmarks`, points and tracks that the depth is held
-      against and that go
-          no further, where the source has any; else its `points`; else the views' depths are held
-          against one another.
+    Args: where: the source's folder. Fields: `landmarks`, points and tracks for this check alone,
+      where the source has any; else its `points`; else the views' depths are compared with one
+      another.
     Raises:  DataFailure naming the folder where the depth fits in no unit.
-    Choices: shares of pixels that agree within SAME, of units between those that put what is seen
-      nearer than cameras are apart, and far beyond; the unit is then that of the least mean miss,
-      cut off at a third of SAME. Depth is left as it is where too few pixels can be compared, and
-      where hardly more agree in any other unit. It fits in no unit where no more agree than if all
-      were far away, as walls do that look alike from there.
+    Choices: candidates are units from depths nearer than the distance of cameras to far beyond,
+      scored by the share of pixels that agree within SAME; the best is refined to the least mean
+      error, clipped at a third of SAME. Depth is left as it is where too few pixels can be
+      compared, and where hardly more agree in any other unit. It fits in no unit where no more
+      agree than at a depth far beyond, where all surfaces look alike.
     """
     notes, landmarks = fields["source"]["notes"], fields.pop("landmarks", None)
     notes += [
@@ -177,8 +172,7 @@ def fit(fields: dict[str, Any], where: Path) -> None:
         if as_it_is < DOUBTED:
             notes.append(
                 f"Only {as_it_is:.0%} of the depth's pixels agree with {against(evidence)} within "
-                f"{SAME:.0%}; "
-                "ingest.depth=off leaves it out."
+                f"{SAME:.0%}; ingest.depth=off leaves it out."
             )
         return
     unit = refined(evidence, units[int(np.argmax(shares))])
@@ -196,85 +190,80 @@ def fit(fields: dict[str, Any], where: Path) -> None:
     how = f"1 / ({unit.slope:.5g} d + {unit.shift:.5g})" if unit.inverse else f"{unit.slope:.5g} d"
     notes.append(
         f"Depth d was in another unit than the poses and is taken as {how}: {share:.0%} of pixels "
-        "agree with "
-        f"{against(evidence)} within {SAME:.0%}, {as_it_is:.0%} before."
+        f"agree with {against(evidence)} within {SAME:.0%}, {as_it_is:.0%} before."
     )
 
 
 def codes(fields: dict[str, Any]) -> list[tuple[float, float]]:
-    """Make depth nan where it holds a value that stands for unknown: each value, and its share of
-    the pixels.
+    """Replace codes for unknown in depth by nan; each code, and its share of the pixels.
 
-    Choices: single values that many pixels hold, far from what all others do: what is photographed
-      hangs together.
+    Choices: a code is a single value of many pixels, far from the range of all others.
     """
     depth = fields["depth"]
     some = depth[:, ::2, ::2]
     values, counts = np.unique(some[some > 0], return_counts=True)
-    often = counts >= HELD * some.size
+    often = counts >= FREQUENT * some.size
     if not often.any() or often.all():
         return []
     rest = np.repeat(values[~often], counts[~often])
-    low, high = np.quantile(rest, (HELD, 1 - HELD))
-    found = values[often & ((values > FAR * high) | (values < low / FAR))]
-    shares = [float((depth == value).mean()) for value in found]
-    if len(found):
-        depth[np.isin(depth, found)] = np.nan
-    return list(zip(found.tolist(), shares, strict=True))
+    low, high = np.quantile(rest, (FREQUENT, 1 - FREQUENT))
+    outlying = values[often & ((values > FAR * high) | (values < low / FAR))]
+    shares = [float((depth == value).mean()) for value in outlying]
+    if len(outlying):
+        depth[np.isin(depth, outlying)] = np.nan
+    return list(zip(outlying.tolist(), shares, strict=True))
 
 
-def evidence_of(fields: dict[str, Any], held: dict[str, Any]) -> Evidence:
-    """What the depth is held against: points where they tell enough, otherwise the views
-    themselves.
-    """
-    if held.get("points") is not None:
-        tracks = held.get("tracks")
-        at = AtPoints(fields, held["points"], np.zeros((0, 2), int) if tracks is None else tracks)
+def evidence_of(fields: dict[str, Any], references: dict[str, Any]) -> Evidence:
+    """Evidence for the depth: points, where there are enough, otherwise the views themselves."""
+    if references.get("points") is not None:
+        tracks = references.get("tracks")
+        at = AtPoints(
+            fields, references["points"], np.zeros((0, 2), int) if tracks is None else tracks
+        )
         if len(at.stored) >= LEAST:
             return at
     return BetweenViews(fields)
 
 
 def against(evidence: Evidence) -> str:
-    """What the depth was held against, in words."""
+    """Name of the evidence in a note."""
     return "the source's points" if isinstance(evidence, AtPoints) else "what other views see"
 
 
 def agreeing(evidence: Evidence, unit: Unit, within: float = SAME) -> float:
-    """The share of the pixels that can be compared that agree so far; 0 where too few can."""
+    """Share of the comparable pixels that agree within a bound; 0 where too few can be compared."""
     misses = evidence.misses(unit)
     return float((misses < within).mean()) if len(misses) > COMPARED * len(evidence.stored) else 0.0
 
 
 def scales(evidence: Evidence) -> list[Unit]:
-    """Scales in steps of 3 %, between the nearest and the farthest that what is seen may lie."""
+    """Candidate scales in steps of 3 %, over the evidence's range of depth."""
     low, high = np.log(evidence.between)
     return [Unit(float(np.exp(z) / np.median(evidence.stored))) for z in np.arange(low, high, 0.03)]
 
 
 def inverses(evidence: Evidence) -> list[Unit]:
-    """Inverse depths whose near end lies between the same, in steps of 15 %, and whose far end is
-    e^0.4 to e^5 times as far; none where the stored depth does not vary.
+    """Candidate units of inverse depth: near ends over the range of depth in steps of 15 %, far
+    ends e^0.4 to e^5 times as far; none where the stored depth does not vary.
     """
     near, far = np.quantile(evidence.stored, (0.95, 0.05))
     if near == far:
         return []
     low, high = np.log(evidence.between)
-    found = []
+    units = []
     for end, ratio in itertools.product(np.arange(low, high, 0.15), np.arange(LEAST_RATIO, 5, 0.4)):
         slope = (np.exp(-end) - np.exp(-end - ratio)) / (near - far)
-        found.append(Unit(float(slope), float(np.exp(-end) - slope * near), True))
-    return found
+        units.append(Unit(float(slope), float(np.exp(-end) - slope * near), True))
+    return units
 
 
 def refined(evidence: Evidence, unit: Unit) -> Unit:
-    """The unit near a given one of the least mean miss, cut off at SAME and then at a third of
-    it.
-    """
+    """Refinement of a unit to the least mean error, clipped at SAME and then at a third of it."""
     near, far = np.quantile(evidence.stored, (0.95, 0.05))
 
     def changed(x: np.ndarray) -> Unit:
-        """By the logarithms of what the near and the far end are multiplied by."""
+        """The unit whose near and far end are multiplied by exp(x)."""
         if not unit.inverse:
             return Unit(float(unit.slope * np.exp(x[0])))
         ends = (unit.slope * np.array([near, far]) + unit.shift) * np.exp(-x)

@@ -1,6 +1,4 @@
-"""The generated source: a procedural room, ray-cast. Exact depth and labels; the same bytes for a
-seed.
-"""
+"""The generated source: a ray-cast procedural room with exact depth and labels."""
 
 from __future__ import annotations
 
@@ -16,8 +14,11 @@ from chebsplat.synthetic.shuffled import build
 from chebsplat.synthetic.textures import colors, dot, shade, tone_map
 
 SIZES = {  # views, width, height
-    "office": (80, 320, 240), "room": (80, 320, 240), "shuffled": (80, 320, 240), "toy": (16, 96, 72),
-}  # fmt: skip
+    "office": (80, 320, 240),
+    "room": (80, 320, 240),
+    "shuffled": (80, 320, 240),
+    "toy": (16, 96, 72),
+}
 EDGE_SAMPLES = 3  # rays along each side of a pixel on an edge
 
 
@@ -54,10 +55,8 @@ def photograph(
     centres = np.stack([x.ravel(), y.ravel()], 1)
     hits, rays = trace(caster, K, pose, centres)
     light = shaded(room, caster, pose, rays, hits)
-    image, part = (
-        light.reshape(height, width, 3),
-        np.where(hits.triangle >= 0, room.soup.parts[hits.triangle], -1),
-    )
+    image = light.reshape(height, width, 3)
+    part = np.where(hits.triangle >= 0, room.soup.parts[hits.triangle], -1)
     edge = is_edge(part.reshape(height, width), hits.normals.reshape(height, width, 3))
     rows, columns = np.nonzero(edge)
     steps = (np.arange(EDGE_SAMPLES) + 0.5) / EDGE_SAMPLES
@@ -76,9 +75,7 @@ def photograph(
 def trace(
     caster: RayCaster, K: np.ndarray, pose: np.ndarray, pixels: np.ndarray
 ) -> tuple[Hits, np.ndarray]:
-    """Hits of rays through pixels [N, 2]; directions have z = 1 in the camera, so distance is
-    z-depth.
-    """
+    """Hits of rays through pixels [N, 2], and the rays; their z is 1, so distance is z-depth."""
     camera = np.concatenate(
         [(pixels - K[:2, 2]) / (K[0, 0], K[1, 1]), np.ones((len(pixels), 1))], 1
     )
@@ -91,20 +88,20 @@ def shaded(
     room: Room, caster: RayCaster, pose: np.ndarray, rays: np.ndarray, hits: Hits
 ) -> np.ndarray:
     """Linear light [N, 3] along rays; black where nothing is hit."""
-    seen = hits.triangle >= 0
-    triangle, rays, distance = hits.triangle[seen], rays[seen], hits.distance[seen]
+    hit = hits.triangle >= 0
+    triangle, rays, distance = hits.triangle[hit], rays[hit], hits.distance[hit]
     eye = (-pose[:3, :3].T @ pose[:3, 3]).astype(np.float32)
     points = eye + rays * distance[:, None]
     to_eye = -rays / np.sqrt(dot(rays, rays))
-    normals = hits.normals[seen]
+    normals = hits.normals[hit]
     normals = normals * np.where(dot(normals, to_eye) < 0, np.float32(-1), np.float32(1))
     part, material = room.soup.parts[triangle], room.soup.materials[triangle]
     local = np.einsum("nij,nj->ni", room.soup.rotations[part], points - room.soup.origins[part])
     albedo = colors(local, material, room.materials)
     gloss = np.array([m.gloss for m in room.materials], np.float32)[material]
     shininess = np.array([m.shininess for m in room.materials], np.float32)[material]
-    light = np.zeros((len(seen), 3), np.float32)
-    light[seen] = shade(
+    light = np.zeros((len(hit), 3), np.float32)
+    light[hit] = shade(
         points, normals, to_eye, albedo, gloss, shininess, room.lights, caster.is_blocked
     )
     return light

@@ -1,9 +1,8 @@
-"""Label maps: where a source has them, what they are taken for, and which class each of their
-pixels is of.
+"""Label maps of a source: their files, their kind, and the class of each pixel.
 
 A view's map is a PNG of ids (grey, or a palette's), a PNG of colours, an .npy of ids [h, w] or of
 scores by class ([C, h, w] or [h, w, C]), or a folder with one mask a class. All maps of a source
-are of one kind, which is said.
+are of one kind, which is logged.
 """
 
 from __future__ import annotations
@@ -27,13 +26,16 @@ from chebsplat.stages.sources.pictures import DEEP, GREY, companion, fits, neare
 from chebsplat.stages.sources.texts import LONGEST, shortened, whole
 
 IDS, COLORS, SCORES, MASKS = "ids", "colours", "scores by class", "one mask a class"
-# Joined: what sets call pixels that nobody labelled. "Other" and the like are classes.
-VOID = {"void", "ignore", "ignored", "ignoreregion", "unlabeled", "unlabelled", "notlabeled", "notlabelled", "nolabel",
-        "unannotated", "notannotated", "unassigned", "unclassified", "undefined", "unknown", "invalid", "none", "null",
-        "nan", "n/a", "noclass", "dontcare", "outlier"}  # fmt: skip
+# names, `joined`, of unlabelled pixels in data sets; "other" and the like are classes
+VOID = {
+    "void", "ignore", "ignored", "ignoreregion", "unlabeled", "unlabelled", "notlabeled",
+    "notlabelled", "nolabel", "unannotated", "notannotated", "unassigned", "unclassified",
+    "undefined", "unknown", "invalid", "none", "null", "nan", "n/a", "noclass", "dontcare",
+    "outlier",
+}  # fmt: skip
 BACKGROUND = "background"  # void where it is 0 or one of CODES, otherwise a class
 CODES = (255, 65_535)  # the highest of 8 and 16 bits, which stand for void
-MAX_ID = 65_535  # what 16 bits hold
+MAX_ID = 65_535  # of 16 bits
 DOCUMENTS = ("scene.json", "labels.json")  # that may name ids
 MAX_COLORS = 1024  # a picture with more is no map of labels
 REMEDY = "add it, or take its folder away to do without"
@@ -53,26 +55,25 @@ def files_below(folder: Path) -> list[str]:
 
 
 def of_views(place: Path, names: Sequence[str]) -> dict[str, LabelFile]:
-    """The map of each view that has one: a file that is called like it; or a mask a class, as
-    VIEW/CLASS.png or CLASS/VIEW.png.
+    """Maps by view: a file of its name; or a mask a class, as VIEW/CLASS.png or CLASS/VIEW.png.
 
-    Choices: a file lies in the folders of its view, or in fewer; what lies in another is a mask.
-    Raises:  InputError where one view has two, or none of the files is called like a view.
+    Choices: a file lies in the folders of its view, or in fewer; in any other folder it is a mask.
+    Raises:  InputError where one view has two, or no file has the name of a view.
     """
     files = files_below(place)
     common.distinct(sorted((os.path.splitext(name)[0], place / name) for name in files))
-    found = common.matched(names, files)
+    matches = common.matched(names, files)
     maps: dict[str, LabelFile] = {
-        name: place / file for name, file in found.items() if _in_folders_of(name, file)
+        name: place / file for name, file in matches.items() if _in_folders_of(name, file)
     }
     if maps:
         return maps
-    held: dict[str, dict[str, Path]] = {}
+    by_folder: dict[str, dict[str, Path]] = {}
     for file in files:
         folder, name = os.path.split(os.path.splitext(file)[0])
-        held.setdefault(folder, {})[name] = place / file
-    folders = common.matched(names, held.keys() - {""})
-    masks = {name: held[folder] for name, folder in folders.items()}
+        by_folder.setdefault(folder, {})[name] = place / file
+    folders = common.matched(names, by_folder.keys() - {""})
+    masks = {name: by_folder[folder] for name, folder in folders.items()}
     for label in () if masks else {file.partition("/")[0] for file in files if "/" in file}:
         own = [file.removeprefix(f"{label}/") for file in files if file.startswith(f"{label}/")]
         for name, file in common.matched(names, own).items():
@@ -86,7 +87,7 @@ def of_views(place: Path, names: Sequence[str]) -> dict[str, LabelFile]:
 
 
 def _in_folders_of(name: str, file: str) -> bool:
-    """Whether a file lies in the folders of its view, or in the innermost of them."""
+    """True where a file lies in the folders of its view, or in the innermost of them."""
     view, folders = (path.casefold().split("/")[:-1] for path in (name, file))
     return folders == view[len(view) - len(folders) :]
 
@@ -98,13 +99,13 @@ def files(folder: Path, places: Sequence[str] = LABELS) -> list[Path]:
 
 
 def give(listing: Listing, folder: Path, places: Sequence[str] = LABELS) -> None:
-    """Give the frames of a listing the maps of a source's folder, where one of `places` in it holds
-    any, and the listing their names.
+    """Give the frames of a listing their maps in the first of a folder's `places` that holds any,
+    and the listing the names of the ids.
     """
     full = [place for place in places if any(files_below(folder / place))]
     for place in places if not full else ():
-        if (folder / place).is_dir() and (found := os.listdir(folder / place)):
-            listing.notes.append(f"{place}/ holds no PNG or .npy: not read ({few(found)}).")
+        if (folder / place).is_dir() and (entries := os.listdir(folder / place)):
+            listing.notes.append(f"{place}/ holds no PNG or .npy: not read ({few(entries)}).")
     if not full or not listing.frames:
         return
     listing.label_place = full[0]
@@ -119,7 +120,7 @@ def give(listing: Listing, folder: Path, places: Sequence[str] = LABELS) -> None
 
 
 def bits_of_ids(path: Path) -> int | None:
-    """8 or 16, of a map that is a picture of ids in one channel; None of any other."""
+    """Bits of a map of ids in one channel, 8 or 16; None of any other map."""
     if path.suffix == ".npy":
         return None
     with opened(path, REMEDY) as image:
@@ -127,9 +128,7 @@ def bits_of_ids(path: Path) -> int | None:
 
 
 def names_in(folder: Path) -> dict[int, str] | None:
-    """Class names by id, of scene.json's "labels" or of labels.json: {"id": name}, or {"#rrggbb":
-    name} of colours.
-    """
+    """Class names by id, of scene.json's "labels" or of labels.json: {"id" or "#rrggbb": name}."""
     scene, plain = DOCUMENTS
     path = folder / scene
     table = texts.read_json(path).get("labels") if common.present(path) else None
@@ -143,9 +142,7 @@ def names_in(folder: Path) -> dict[int, str] | None:
 
 
 def names_by_id(path: Path, entries: Iterable[tuple[Any, Any]]) -> dict[int, str]:
-    """Class names by id, from pairs in a document; ids may be written as text, colours as #rrggbb.
-    InputError.
-    """
+    """Class names by id, from pairs (id as number or text, or #rrggbb; name). Raises InputError."""
     names: dict[int, str] = {}
     for key, name in entries:
         try:
@@ -167,8 +164,8 @@ def names_by_id(path: Path, entries: Iterable[tuple[Any, Any]]) -> dict[int, str
 
 
 def read(frame: Frame, listing: Listing, size: tuple[int, int], at: np.ndarray) -> np.ndarray:
-    """Raw ids i32 [H, W], -1 none, at positions `at` [2, H, W] of a frame's map, its corrected
-    objects replaced; what kind the map is of is written down in the listing.
+    """Raw ids i32 [H, W], -1 none, at positions `at` [2, H, W] of a frame's map, with corrected
+    objects; records the map's kind in the listing.
     """
     assert frame.labels is not None
     if isinstance(frame.labels, dict):
@@ -187,14 +184,13 @@ def read(frame: Frame, listing: Listing, size: tuple[int, int], at: np.ndarray) 
 
 
 def _of_image(path: Path, size: tuple[int, int], at: np.ndarray) -> tuple[str, np.ndarray]:
-    """Kind and raw ids of a PNG; what is transparent has none."""
+    """Kind and raw ids of a PNG; transparent pixels have none."""
 
     def check(image: Any) -> None:
         if image.format != "PNG":
             raise InputError(
                 f"{path} is a {image.format} picture, in which ids and colours are no longer "
-                "exact; write label maps "
-                "as PNG or .npy"
+                "exact; write label maps as PNG or .npy"
             )
         if image.mode not in (*GREY, "1", "LA", "RGB", "RGBA"):
             raise InputError(
@@ -217,15 +213,14 @@ def _of_image(path: Path, size: tuple[int, int], at: np.ndarray) -> tuple[str, n
 
 def packed(colors: np.ndarray) -> np.ndarray:
     """Colours [..., 3] of 8 bits as one number each, red first."""
-    found: np.ndarray = colors.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32)
-    return found
+    return np.asarray(colors.astype(np.int32) @ np.array([1 << 16, 1 << 8, 1], np.int32))
 
 
 def _of_array(path: Path, size: tuple[int, int]) -> tuple[str, np.ndarray]:
     """Kind and raw ids i32 [h, w] of an .npy, in its own resolution.
 
     Choices: the axis of classes is the one without which the array has the photo's shape; the
-      highest score wins, and where all are equal there is no label. Negative ids are none.
+      highest score wins; equal scores, and negative ids, mean no label.
     """
     values = read_npy(path, REMEDY)
     if values.ndim == 3:
@@ -268,12 +263,11 @@ def _of_masks(
 ) -> np.ndarray:
     """Raw ids of masks by class, -1 in none of them.
 
-    Choices: a mask is where its picture is brighter than half of its brightest; of two that overlap
-      the smaller lies on top.
+    Choices: a mask is true above half of its brightest value; of two that overlap the smaller wins.
     """
     number = {name: which for which, name in names.items()}
-    seen = {name: companion(path, size, at) for name, path in masks.items()}
-    inside = {name: 2 * grey.astype(int) > max(int(grey.max()), 1) for name, grey in seen.items()}
+    greys = {name: companion(path, size, at) for name, path in masks.items()}
+    inside = {name: 2 * grey.astype(int) > max(int(grey.max()), 1) for name, grey in greys.items()}
     ids = np.full(at.shape[1:], -1, np.int32)
     for name in sorted(inside, key=lambda name: (-int(inside[name].sum()), name)):
         ids[inside[name]] = number[name]
@@ -281,8 +275,7 @@ def _of_masks(
 
 
 def resolved(listing: Listing, raw: np.ndarray) -> tuple[str, np.ndarray]:
-    """What all maps of a listing are taken for, and their raw ids [V, H, W]; colours that are all
-    grey are ids.
+    """Kind of all maps of a listing, and their raw ids [V, H, W]; colours all grey are ids.
 
     Raises: InputError where they are of two kinds, or of more colours than labels have.
     """
@@ -292,9 +285,9 @@ def resolved(listing: Listing, raw: np.ndarray) -> tuple[str, np.ndarray]:
             kind: [view for view, of in listing.label_kinds.items() if of == kind]
             for kind in sorted(kinds)
         }
-        told = ", ".join(f"{kind} ({few(some)})" for kind, some in views.items())
+        listed = ", ".join(f"{kind} ({few(some)})" for kind, some in views.items())
         raise InputError(
-            f"{listing.label_place}/ holds label maps of several kinds: {told}; write them alike"
+            f"{listing.label_place}/ holds label maps of several kinds: {listed}; write them alike"
         )
     (kind,) = kinds
     if kind == COLORS and all(
@@ -310,9 +303,7 @@ def resolved(listing: Listing, raw: np.ndarray) -> tuple[str, np.ndarray]:
 
 
 def line(listing: Listing, kind: str, labels: np.ndarray) -> str:
-    """What the maps were taken for, in one sentence. labels: i16 [V, H, W], class indices, -1
-    none.
-    """
+    """Kind and coverage of the maps in words. labels: i16 [V, H, W], class indices, -1 none."""
     named = (
         ""
         if kind == MASKS
@@ -320,11 +311,11 @@ def line(listing: Listing, kind: str, labels: np.ndarray) -> str:
         if listing.label_names is not None
         else (" without names")
     )
-    known = labels >= 0
+    has_label = labels >= 0
     return (
         f"Labels of {listing.label_place}/ are taken for {kind}{named}: "
-        f"{len(np.unique(labels[known]))} classes, "
-        f"{known.mean():.1%} of the pixels, in {known.any((1, 2)).sum()} of {len(labels)} views."
+        f"{len(np.unique(labels[has_label]))} classes, {has_label.mean():.1%} of the pixels, in "
+        f"{has_label.any((1, 2)).sum()} of {len(labels)} views."
     )
 
 
@@ -335,28 +326,31 @@ def indexed(
     kind: str = IDS,
     what: str = "Label",
 ) -> tuple[np.ndarray, list[str], list[str]]:
-    """Raw ids [V, H, W] (-1: none) as indices i16 into class names; the names, and notes on what
-    became -1.
+    """Raw ids [V, H, W] (-1: none) as indices i16 into class names; the names; notes.
 
-    Choices: the classes are those that occur, in the order of their ids, or `class_names` where
-      given; names that are spelt differently are one. Ids are named by `names`, else by their place
-      in `class_names`, else as `unnamed` does. Names that say void (`is_void`) are ignored.
+    Choices: the classes are `class_names`, or else those that occur, in the order of their ids;
+      spellings of one name are one class. Ids are named by `names`, else by their place in
+      `class_names`, else as `unnamed` does. Void names (`is_void`) are ignored.
     Raises:  DataFailure if nothing is left.
     """
     shares = _shares(raw)
     present = [value for value in sorted(shares) if value >= 0]
     notes: list[str] = []
     if names is None and class_names is None:
-        known, notes = unnamed(present, shares, kind, what)
+        name_of, notes = unnamed(present, shares, kind, what)
     else:
-        known = names if names is not None else dict(enumerate(class_names or ()))
-        if nameless := [v for v in present if v not in known]:
-            notes.append(f"{what} ids without a name are ignored: {_told(nameless, shares, kind)}.")
+        name_of = names if names is not None else dict(enumerate(class_names or ()))
+        if nameless := [v for v in present if v not in name_of]:
+            notes.append(
+                f"{what} ids without a name are ignored: {_format_ids(nameless, shares, kind)}."
+            )
     codes = (0, *CODES) if kind == IDS else (0,)
-    if void := [v for v in present if v in known and is_void(known[v], v in codes)]:
-        of = ", ".join(dict.fromkeys(known[v] for v in void))
-        notes.append(f"{what}s called {of} are void and ignored: {_told(void, shares, kind)}.")
-    named = {v: known[v] for v in present if v in known and v not in void}
+    if void := [v for v in present if v in name_of and is_void(name_of[v], v in codes)]:
+        of = ", ".join(dict.fromkeys(name_of[v] for v in void))
+        notes.append(
+            f"{what}s called {of} are void and ignored: {_format_ids(void, shares, kind)}."
+        )
+    named = {v: name_of[v] for v in present if v in name_of and v not in void}
     result = list(class_names or {joined(name): name for name in named.values()}.values())
     rows = dict(zip(named, rows_of(named.values(), result), strict=True))
     if foreign := sorted({named[v] for v, row in rows.items() if row < 0}):
@@ -364,9 +358,9 @@ def indexed(
             f"{what}s that are not among the class names are ignored: {', '.join(foreign)}."
         )
     if max(rows.values(), default=-1) < 0:
-        shown = ", ".join(_shown(v, kind) for v in present[:8])
+        examples = ", ".join(_format_id(v, kind) for v in present[:8])
         raise DataFailure(
-            f"no label has a name ({kind} [{shown}]); give names (labels.json), or "
+            f"no label has a name ({kind} [{examples}]); give names (labels.json), or "
             "take the labels away"
         )
     every = np.array(sorted(shares))
@@ -382,31 +376,28 @@ def unnamed(
 ) -> tuple[dict[int, str], list[str]]:
     """Names of ids that a source does not name, and a note on the one that stands for void.
 
-    Choices: ids are class_<id> without 0, or without what `void_code` tells, 0 being a class then;
-      colours are themselves, without black; of scores each is a class.
+    Choices: ids are class_<id>, but for 0, or for `void_code`, 0 being a class then; colours are
+      themselves, but for black; of scores each is a class.
     """
     code = void_code(present) if kind == IDS else None
     void = [v for v in present if v == (0 if code is None else code)] if kind != SCORES else []
-    known = {
-        v: _shown(v, kind) if kind == COLORS else f"class_{v}" for v in present if v not in void
+    name_of = {
+        v: _format_id(v, kind) if kind == COLORS else f"class_{v}" for v in present if v not in void
     }
-    told = (
+    meaning = (
         "is taken for none of the classes"
         if code is None
         else ("is taken for void, and 0 for a class")
     )
-    lost = f"; {_told(void, shares, kind)} {told}" if void else ""
-    return known, [f"{what}s have no names (labels.json){lost}."]
+    lost = f"; {_format_ids(void, shares, kind)} {meaning}" if void else ""
+    return name_of, [f"{what}s have no names (labels.json){lost}."]
 
 
 def void_code(present: Sequence[int]) -> int | None:
-    """Which of CODES stands for void among ids without names, 0 being a class then; None where none
-    does.
+    """The one of CODES that means void among ids without names, 0 being a class then; None if none.
 
-    Choices: the highest id is one of them, far above the others, which are two at least and fill
-      half of the numbers up
-      to the highest of them: a data set's ids, of which some do not occur here. 0 and 255 alone are
-        a mask.
+    Choices: it is the highest id, far above the others, which are at least two and make up half of
+      the numbers to the highest of them, as ids of a data set do. 0 and 255 alone are a mask.
     """
     *others, code = present or [0]
     dense = len(others) > 1 and 2 * len(others) > max(others)
@@ -414,12 +405,12 @@ def void_code(present: Sequence[int]) -> int | None:
 
 
 def is_void(name: str, coded: bool) -> bool:
-    """Whether a name says that nobody labelled its pixels; coded: their id usually says so."""
+    """True where a name means unlabelled pixels; coded: of an id that usually does."""
     return joined(name) in VOID or (coded and joined(name) == BACKGROUND)
 
 
 def _shares(raw: np.ndarray) -> Counter[int]:
-    """The share of the pixels that each raw id has."""
+    """Share of the pixels of each raw id."""
     shares: Counter[int] = Counter()
     for view in raw:
         values, counts = np.unique(view, return_counts=True)
@@ -427,10 +418,10 @@ def _shares(raw: np.ndarray) -> Counter[int]:
     return shares
 
 
-def _shown(value: int, kind: str) -> str:
+def _format_id(value: int, kind: str) -> str:
     return f"#{value:06x}" if kind == COLORS else str(value)
 
 
-def _told(values: Sequence[int], shares: Counter[int], kind: str) -> str:
-    """Ids and the share of the pixels that they have."""
-    return ", ".join(f"{_shown(v, kind)} ({shares[v]:.1%} of the pixels)" for v in values)
+def _format_ids(values: Sequence[int], shares: Counter[int], kind: str) -> str:
+    """Ids with their shares of the pixels."""
+    return ", ".join(f"{_format_id(v, kind)} ({shares[v]:.1%} of the pixels)" for v in values)

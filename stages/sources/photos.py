@@ -1,6 +1,4 @@
-"""The photos source: a folder of images and nothing else. Cameras and poses come from the stage
-`pose`.
-"""
+"""The photos source: a folder of images alone. Cameras and poses come from the stage `pose`."""
 
 from __future__ import annotations
 
@@ -24,13 +22,11 @@ from chebsplat.stages.sources.colmap_model import Cloud
 from chebsplat.stages.sources.common import Frame, Listing, Shot, file_of
 from chebsplat.stages.sources.pictures import DEEP, open_photo
 
-SEAM = 3.0  # times what neighbouring columns differ by: a panorama's first and last differ by less
+SEAM = 3.0  # times the difference of neighbouring columns, above that of a panorama's two ends
 
 
 def read(folder: Path, settings: IngestSection, model: PhotoModel) -> dict[str, Any]:
-    """The fields of a capture: the photos of a model, without what their lenses bend, and its
-    points.
-    """
+    """The fields of a capture: the photos of a model, undistorted, and its points."""
     shots = {shot.name: shot for shot in _listed(folder)[0]}
     if absent := [name for name in model.names if name not in shots]:
         raise InputError(
@@ -51,7 +47,7 @@ def read(folder: Path, settings: IngestSection, model: PhotoModel) -> dict[str, 
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """What a folder of photos brings beside them: nothing."""
+    """A folder of photos has neither poses, depth nor labels."""
     return {"poses": False, "depth": False, "labels": False}
 
 
@@ -63,9 +59,8 @@ def files(folder: Path) -> list[Path]:
 
 
 def _photos(folder: Path) -> tuple[Path, list[str]]:
-    """The folder of the photos, and their paths below it: those that lie in it; otherwise in
-    images/ or the like; otherwise in its subfolders, one for each camera. Raises InputError if
-    there are none.
+    """The folder of the photos, and their paths below it: directly in it, else in images/ or the
+    like, else in its subfolders, one for each camera. Raises InputError if there are none.
     """
     try:
         names = [name for name in os.listdir(folder) if is_image(name)]
@@ -76,10 +71,8 @@ def _photos(folder: Path) -> tuple[Path, list[str]]:
         place = common.photo_folder(folder)
         names = list(common.names_below(place))
     if not names:
-        place, inner = (
-            folder,
-            [name for name in common.with_photos(folder) if name not in common.BESIDE],
-        )
+        place = folder
+        inner = [name for name in common.with_photos(folder) if name not in common.BESIDE]
         names = [f"{name}/{file}" for name in inner for file in common.names_below(folder / name)]
     if not names:
         raise InputError(f"{folder} holds no .jpg, .png or .heic image; correct source.path")
@@ -87,73 +80,70 @@ def _photos(folder: Path) -> tuple[Path, list[str]]:
 
 
 def shots(
-    folder: Path, settings: PoseSection, shown: Progress | None, finer: int
+    folder: Path, settings: PoseSection, reporter: Progress | None, finer: int
 ) -> tuple[list[Shot], list[str]]:
     """The photos of a folder, at most `max_views` of them, evenly chosen, and notes about them."""
-    found, notes = _listed(folder)
+    listed, notes = _listed(folder)
     first: dict[str, Shot] = {}
-    for shot in found:
+    for shot in listed:
         first.setdefault(sha256_file(shot.path), shot)
-    if len(first) < len(found):
+    if len(first) < len(listed):
         notes.append(
-            f"{len(found) - len(first)} of {len(found)} photos are copies of others, and left out."
+            f"{len(listed) - len(first)} of {len(listed)} photos are copies of others, and left "
+            "out."
         )
-        found = list(first.values())
-    if settings.max_views is not None and len(found) > settings.max_views:
-        rows = np.linspace(0, len(found) - 1, settings.max_views).round().astype(int)
-        notes.append(f"{len(rows)} of {len(found)} photos are used (pose.max_views).")
-        found = [found[row] for row in rows]
-    if n := sum(shot.focal is None and not shot.panorama for shot in found):
+        listed = list(first.values())
+    if settings.max_views is not None and len(listed) > settings.max_views:
+        rows = np.linspace(0, len(listed) - 1, settings.max_views).round().astype(int)
+        notes.append(f"{len(rows)} of {len(listed)} photos are used (pose.max_views).")
+        listed = [listed[row] for row in rows]
+    if n := sum(shot.focal is None and not shot.panorama for shot in listed):
         notes.append(
-            f"{n} of {len(found)} photos have no focal length; it is found with the poses."
+            f"{n} of {len(listed)} photos have no focal length; it is found with the poses."
         )
-    return found, notes
+    return listed, notes
 
 
-def save(found: Sequence[Shot], _: Path, pictures: Path, max_side: int) -> None:
-    """Write photos, reduced until no side exceeds `max_side`, and their masks, where pycolmap looks
-    for them.
-    """
-    for row, shot in enumerate(found):
+def save(photos: Sequence[Shot], _: Path, pictures: Path, max_side: int) -> None:
+    """Write photos, reduced until no side exceeds `max_side`, and their masks, for pycolmap."""
+    for row, shot in enumerate(photos):
         size = shot.reduced(max_side)
         with open_photo(shot.path, shot.size, upright=True) as (image, _opaque):
             small = image if image.size == size else image.resize(size, Image.Resampling.BOX)
             small.save(pictures / file_of(row), compress_level=1)
-        if any(other.mask for other in found):  # pycolmap wants one of every photo then
+        if any(other.mask for other in photos):  # pycolmap then needs one of every photo
             (pictures / "masks").mkdir(exist_ok=True)
-            seen = np.full(shot.size[::-1], 255, np.uint8)
+            valid = np.full(shot.size[::-1], 255, np.uint8)
             if shot.mask is not None:
                 with opened(shot.mask) as mask:
-                    seen = np.where(
+                    valid = np.where(
                         np.asarray(mask.convert("L") if mask.mode not in DEEP else mask) > 0, 255, 0
                     )
-            mask = Image.fromarray(seen.astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
+            mask = Image.fromarray(valid.astype(np.uint8)).resize(size, Image.Resampling.NEAREST)
             mask.save(pictures / "masks" / f"{file_of(row)}.png")
 
 
 def _listed(folder: Path) -> tuple[list[Shot], list[str]]:
     place, names = _photos(folder)
     masks, notes = common.masks_in(folder, names)
-    found = []
+    listed = []
     for name in names:
         size, focal = header(place / name)
         panorama = focal is None and size[0] == 2 * size[1] and wraps(place / name, size)
-        found.append(Shot(common.stem(name), place / name, size, focal, masks.get(name), panorama))
+        listed.append(Shot(common.stem(name), place / name, size, focal, masks.get(name), panorama))
     used = {place.name, *(name.partition("/")[0] for name in names)}
     if beside := set(common.with_photos(folder)) - used:
         notes.append(
             "Photos in these folders are not read: "
             f"{', '.join(sorted(beside, key=common.natural))}."
         )
-    found.sort(key=lambda shot: common.natural(shot.name))
-    common.distinct((shot.name, shot.path) for shot in found)
-    return found, notes
+    listed.sort(key=lambda shot: common.natural(shot.name))
+    common.distinct((shot.name, shot.path) for shot in listed)
+    return listed, notes
 
 
 def wraps(path: Path, size: tuple[int, int]) -> bool:
-    """Whether a photo ends at the right where it begins at the left, as one of all directions
-    does.
-    """
+    """True where a photo's left and right ends match, as those of a panorama do."""
     with open_photo(path, size, upright=True) as (image, _):
         pixels = np.asarray(image.resize((256, 128), Image.Resampling.BOX), np.float32)
     between = np.abs(np.diff(pixels, axis=1)).mean()

@@ -1,4 +1,4 @@
-"""The images of a source: photos, the one-channel images that belong to them."""
+"""Images of a source: photos, and one-channel images that belong to them."""
 
 from __future__ import annotations
 
@@ -25,23 +25,20 @@ LARGEST = 16 << 20  # bytes of a view's confidences: 4 million in single precisi
 def open_photo(
     path: Path, size: tuple[int, int], upright: bool
 ) -> Iterator[tuple[Any, np.ndarray | None]]:
-    """An RGB image of (width, height) `size`, and where it is opaque (None: everywhere), as
-    `opened` gives one.
+    """An RGB image of (width, height) `size`, and the mask of opaque pixels (None: all).
 
     Choices: a model's own photos are turned by EXIF only if they fit its camera no other way, since
-      COLMAP counts
-      pixels as they are stored. What is transparent is empty: it lies before black, as what is
-        rendered does; alpha
-      under one half is transparent.
+      COLMAP counts pixels as they are stored. Alpha under one half is transparent, and empty; all
+      photos are composed over black, as renders are.
     """
 
     def check(image: Any) -> None:
         if image.mode not in EIGHT_BIT:
             raise InputError(f"{path} is no 8-bit photo (mode {image.mode}); convert it to 8 bits")
-        found = seen_size(image) if upright or image.size != size else image.size
-        if found != size:
+        actual = seen_size(image) if upright or image.size != size else image.size
+        if actual != size:
             raise InputError(
-                f"{path} is {_by(found)}, its camera {_by(size)}; restore the image or its camera"
+                f"{path} is {_by(actual)}, its camera {_by(size)}; restore the image or its camera"
             )
 
     with opened(path, check=check) as image:
@@ -63,19 +60,20 @@ def companion(
     size: tuple[int, int],
     at: np.ndarray,
     modes: set[str] | None = None,
-    wanted: str = "",
+    meaning: str = "",
 ) -> np.ndarray:
     """The pixels at `at` [2, H, W] of a one-channel image that belongs to a photo of (width,
     height) `size`, in any resolution of that photo's shape.
 
-    Args: modes: PIL's, that are taken as they are; None: all, as grey values.
+    Args: modes: PIL's, that are read as they are; None: all, as grey values; meaning: of the modes,
+      for messages.
     Raises: InputError naming the file.
     """
 
     def check(image: Any) -> None:
         if modes is not None and image.mode not in modes:
             raise InputError(
-                f"{path} has mode {image.mode}, not {wanted} in one channel; convert it"
+                f"{path} has mode {image.mode}, not {meaning} in one channel; convert it"
             )
         same_shape(path, image.size, size)
 
@@ -84,37 +82,33 @@ def companion(
         return nearest(np.asarray(grey), at, size)
 
 
-def fits(found: tuple[int, int], size: tuple[int, int]) -> bool:
-    """Whether (width, height) are those of a photo, or have their shape."""
-    return found == size or abs(found[0] * size[1] / (found[1] * size[0]) - 1) < SAME_SHAPE
+def fits(own: tuple[int, int], size: tuple[int, int]) -> bool:
+    """True where (width, height) `own` has the shape of a photo's `size`."""
+    return own == size or abs(own[0] * size[1] / (own[1] * size[0]) - 1) < SAME_SHAPE
 
 
-def same_shape(path: Path, found: tuple[int, int], size: tuple[int, int]) -> None:
-    """Raise InputError where what belongs to a photo has not its shape."""
-    if not fits(found, size):
-        raise InputError(f"{path} is {_by(found)}, its photo {_by(size)}; restore it")
+def same_shape(path: Path, own: tuple[int, int], size: tuple[int, int]) -> None:
+    """Raise InputError where an image has not the shape of the photo that it belongs to."""
+    if not fits(own, size):
+        raise InputError(f"{path} is {_by(own)}, its photo {_by(size)}; restore it")
 
 
 def confidences(path: Path) -> np.ndarray:
-    """The array `confidence` [h, w] of an .npz file, f32 in [0, 1]; nothing in it is unpickled.
-    Raises InputError.
-    """
-    held = read_npz(path, ["confidence"], "copy it again", LARGEST).get("confidence")
-    found = None if held is None else finite32(held)
+    """The array `confidence` [h, w] of an .npz file, f32 in [0, 1]. Raises InputError."""
+    stored = read_npz(path, ["confidence"], "copy it again", LARGEST).get("confidence")
+    values = None if stored is None else finite32(stored)
     if (
-        found is None
-        or found.ndim != 2
-        or not found.size
-        or not ((found >= 0) & (found <= 1 + 1e-4)).all()
+        values is None
+        or values.ndim != 2
+        or not values.size
+        or not ((values >= 0) & (values <= 1 + 1e-4)).all()
     ):
         raise InputError(f"{path}: `confidence` must be an image of values in 0...1; copy it again")
-    return found.clip(0, 1)
+    return values.clip(0, 1)
 
 
 def nearest(values: np.ndarray, at: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Those stored pixels [H, W] of `values` [h, w], or [h, w, C], that hold positions `at` [2, H,
-    W] in a photo of (width, height).
-    """
+    """Pixels [H, W] of `values` [h, w] or [h, w, C] at positions [2, H, W] in a photo of `size`."""
     height, width = values.shape[:2]
     column = np.clip(np.floor(at[0] * (width / size[0])).astype(int), 0, width - 1)
     row = np.clip(np.floor(at[1] * (height / size[1])).astype(int), 0, height - 1)

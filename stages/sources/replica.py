@@ -1,6 +1,4 @@
-"""Replica as two groups have rendered it: NICE-SLAM (results/, traj.txt) and Semantic-NeRF
-(Sequence_1/).
-"""
+"""Replica as rendered by NICE-SLAM (results/, traj.txt) and by Semantic-NeRF (Sequence_1/)."""
 
 from __future__ import annotations
 
@@ -27,9 +25,7 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """Light: reads names only. Depth that some image has, every image must have: `read` fails
-    otherwise.
-    """
+    """Reads names only. Where one image has depth, all must: `read` fails otherwise."""
     if (folder / "results").is_dir():
         depth = any(name.startswith("depth") for name in common.names_below(folder / "results"))
         return {"poses": True, "depth": depth, "labels": False}
@@ -76,19 +72,18 @@ def _listing(folder: Path) -> Listing:
 
 
 def _trajectory(path: Path, names: list[str]) -> np.ndarray:
-    """cam_from_world [V, 4, 4] of the named images from rows of 16 camera-to-world entries, a row
-    for each frame.
+    """cam_from_world [V, 4, 4] of the named images, from a row of 16 camera-to-world entries each.
 
-    Raises:  InputError unless the images are numbered 0 to V − 1 and there are V rows. A row is
-      found by the number in the image's name, so a missing frame cannot shift the others.
+    Raises:  InputError unless the images are numbered 0 to V − 1 and there are V rows: a missing
+      frame must not shift the others.
     """
     rows = texts.read_rows(path)
     if len(rows) != len(names):
         raise InputError(
             f"{path} has {len(rows)} poses for {len(names)} images; restore the file or the images"
         )
-    found = [re.search(r"(\d+)$", name) for name in names]
-    numbers = [int(match[1]) if match else -1 for match in found]
+    matches = [re.search(r"(\d+)$", name) for name in names]
+    numbers = [int(match[1]) if match else -1 for match in matches]
     if sorted(numbers) != list(range(len(names))):
         lacking = next(k for k in range(len(names)) if numbers.count(k) != 1)
         raise InputError(

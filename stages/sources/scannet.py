@@ -1,6 +1,5 @@
-"""ScanNet as its own tools export it, and as two groups lay it out: Semantic Gaussians (SG:
-points3d.ply and a table of
-20 classes) and Panoptic Lifting (PL: splits.json).
+"""ScanNet as exported by its own tools, and by two groups: Semantic Gaussians (SG: points3d.ply and
+a table of 20 classes) and Panoptic Lifting (PL: splits.json).
 """
 
 from __future__ import annotations
@@ -24,17 +23,19 @@ OFF_CENTRE = 0.1  # of the width, by which a principal point may lie off the mid
 POINTS = "points3d.ply"
 # of Mask2Former with test-time augmentation
 PSEUDO, CONFIDENCE = "m2f_semantics", "m2f_probabilities"
-PL_IDS = "semantics"  # where PL has ScanNet's own ids
+PL_IDS = "semantics"  # PL's folder of ScanNet's own ids
 # never in an SG folder
 OF_PL = ("splits.json", "segmentation_data.pkl", "rs_semantics", "m2f_semantics")
 MODIFIED, COMBINED = "scannetv2-labels.modified.tsv", "scannet-labels.combined.tsv"
 OWN = "scannetv2-labels.combined.tsv"  # ScanNet's, of which COMBINED is PL's copy
-NYU = ("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf", "picture", "counter",
-       "blinds", "desk", "shelves", "curtain", "dresser", "pillow", "mirror", "floor mat", "clothes", "ceiling",
-       "books", "refrigerator", "television", "paper", "towel", "shower curtain", "box", "whiteboard", "person",
-       "night stand", "toilet", "sink", "lamp", "bathtub", "bag", "otherstructure", "otherfurniture",
-       "otherprop")  # fmt: skip
-OTHER = "otherprop"  # SG's id 0: known and ignored
+NYU = (
+    "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf",
+    "picture", "counter", "blinds", "desk", "shelves", "curtain", "dresser", "pillow", "mirror",
+    "floor mat", "clothes", "ceiling", "books", "refrigerator", "television", "paper", "towel",
+    "shower curtain", "box", "whiteboard", "person", "night stand", "toilet", "sink", "lamp",
+    "bathtub", "bag", "otherstructure", "otherfurniture", "otherprop",
+)  # fmt: skip
+OTHER = "otherprop"  # SG's id 0: ignored
 CORRECTED = 60_000  # plus an NYU class: raw ids of hand-corrected objects, above all of ScanNet's
 # Objects that the authors of Panoptic Lifting relabel by hand, as ScanNet has them wrong: object id
 # -> NYU class.
@@ -57,9 +58,9 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
     reduced = _is_reduced(folder)
     split = _split(folder / "splits.json") if reduced else None
     if split is not None:
-        known = split[0] | split[1]
-        outside = [frame for frame in listing.frames if frame.name not in known]
-        listing.frames = [frame for frame in listing.frames if frame.name in known]
+        listed = split[0] | split[1]
+        outside = [frame for frame in listing.frames if frame.name not in listed]
+        listing.frames = [frame for frame in listing.frames if frame.name in listed]
         if outside:
             listing.notes.append(
                 f"{len(outside)} frames are in neither list of splits.json and are left out."
@@ -73,17 +74,17 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """Light: reads names only. Depth that some frame has, every frame must have: `read` fails
-    otherwise.
-    """
-    return {"poses": True, "depth": any(common.names_below(folder / "depth")),
-            "labels": _labels_folder(folder) is not None, "pseudo_labels": _has_pseudo_labels(folder)}  # fmt: skip
+    """Reads names only. Where one frame has depth, all must: `read` fails otherwise."""
+    return {
+        "poses": True,
+        "depth": any(common.names_below(folder / "depth")),
+        "labels": _labels_folder(folder) is not None,
+        "pseudo_labels": _has_pseudo_labels(folder),
+    }
 
 
 def files(folder: Path) -> list[Path]:
-    """Poses, intrinsics, points, split, label table, and every image, depth, label and object
-    image.
-    """
+    """Poses, intrinsics, points, split, label table, and images, depth, label and object maps."""
     table = _table(folder)
     with_objects = _is_reduced(folder) and _labels_folder(folder) == PL_IDS
     places = ["color", "depth", *(["instance"] if with_objects else [])]
@@ -108,12 +109,12 @@ def _has_pseudo_labels(folder: Path) -> bool:
 
 
 def _is_reduced(folder: Path) -> bool:
-    """Whether the folder is PL's."""
+    """True where the folder is PL's."""
     return any((folder / name).exists() for name in OF_PL)
 
 
 def _label_places(folder: Path) -> tuple[str, ...]:
-    """Where labels may lie, the best first."""
+    """Folders of labels, the best first."""
     return ("rs_semantics", PL_IDS) if _is_reduced(folder) else ("label-filt", *common.LABELS)
 
 
@@ -122,24 +123,22 @@ def _labels_folder(folder: Path) -> str | None:
 
 
 def _table(folder: Path) -> Path | None:
-    """The nearest table that ScanNet's ids may be looked up in; where there is none, the place
-    where it should be.
-    """
+    """The nearest table of ScanNet's ids; where there is none, the path where it should be."""
     place, reduced = _labels_folder(folder), _is_reduced(folder)
     if place in (None, "rs_semantics"):
         return None
-    wanted = (COMBINED,) if reduced else (MODIFIED, OWN, COMBINED)
+    names = (COMBINED,) if reduced else (MODIFIED, OWN, COMBINED)
     return next(
-        filter(None, (common.nearest_file(folder, name) for name in wanted)), folder / wanted[0]
+        filter(None, (common.nearest_file(folder, name) for name in names)), folder / names[0]
     )
 
 
 def _give_labels(listing: Listing, folder: Path) -> None:
     """Give the frames their label maps, and the listing the names of their ids.
 
-    Choices: PL's have its names; otherwise those of labels.json go first. In label/ and the like
-      ids of 16 bits are ScanNet's own, those of 8 bits NYU's 40, as the set of 25,000 frames has
-      them. Colours and what is in an .npy labels.json alone names.
+    Choices: PL's have its names; otherwise labels.json goes first. In label/ and the like ids of 16
+      bits are ScanNet's own, those of 8 bits NYU's 40, as in the set of 25,000 frames. Colours and
+      .npy files are named by labels.json alone.
     """
     labels.give(listing, folder, _label_places(folder))
     place = listing.label_place
@@ -267,9 +266,7 @@ def _listing(folder: Path) -> Listing:
 
 
 def mapped(path: Path | None) -> dict[int, str]:
-    """Class names by raw id through the table's column `cocomapid`; 0 is `otherprop`, which is no
-    class.
-    """
+    """Class names by raw id through the table's column `cocomapid`; 0 is `otherprop`, no class."""
     names = (OTHER, *scannet_open.CLASSES)
     return {
         raw: names[value] for raw, value in _column(path, MODIFIED, "cocomapid", len(names)).items()
@@ -277,8 +274,7 @@ def mapped(path: Path | None) -> dict[int, str]:
 
 
 def reduced_names(path: Path | None, scene: str) -> tuple[dict[int, str], dict[int, int]]:
-    """Class names by raw id through the table's column `nyu40id`, and the scene's corrections by
-    object id.
+    """Class names by raw id through the table's column `nyu40id`; the corrections by object id.
 
     Choices: an id whose `nyu40id` is empty is NYU's 40, other props; 0 is void.
     """
@@ -292,14 +288,12 @@ def reduced_names(path: Path | None, scene: str) -> tuple[dict[int, str], dict[i
 def _column(
     path: Path | None, name: str, column: str, n_values: int, empty: int | None = None
 ) -> dict[int, int]:
-    """A column of whole numbers below `n_values`, by the column `id`; of an id listed twice the
-    last row counts.
-    """
+    """A column of whole numbers below `n_values`, by the column `id`; an id's last row counts."""
     if path is None or not present(path):
         raise InputError(f"{path} is missing; put {name} into the scene's folder or one above it")
     rows = read_table(path, f"take {name}")
     try:
-        found = {
+        by_id = {
             int(row["id"]): int(row[column]) if row[column] or empty is None else empty
             for row in rows
         }
@@ -308,9 +302,9 @@ def _column(
         raise InputError(
             f"{path} has no usable columns id and {column} ({reason}); take {name}"
         ) from None
-    if not found or min(found) < 0 or not all(0 <= value < n_values for value in found.values()):
+    if not by_id or min(by_id) < 0 or not all(0 <= value < n_values for value in by_id.values()):
         raise InputError(
             f"{path}: ids must not be negative, and values of {column} must lie in "
             f"0...{n_values - 1}; take {name}"
         )
-    return found
+    return by_id

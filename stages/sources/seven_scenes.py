@@ -30,9 +30,7 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """Light: reads names only. What some frame has, every frame must have: `read` fails
-    otherwise.
-    """
+    """Reads names only. Where one frame has depth, all must: `read` fails otherwise."""
     depth = any(
         name.endswith(".depth.png")
         for place in _places(folder)
@@ -43,11 +41,11 @@ def probe(folder: Path) -> dict[str, bool]:
 
 def files(folder: Path) -> list[Path]:
     """The depth camera's intrinsics, and every image, depth and pose."""
-    found = [_intrinsics(folder)]
+    paths = [_intrinsics(folder)]
     for name, image, beside in _frames(folder):
         parts = (image, f"{name}.depth.png", f"{name}.pose.txt")
-        found += [folder / part for part in parts if part in beside]
-    return sorted(path for path in found if path is not None)
+        paths += [folder / part for part in parts if part in beside]
+    return sorted(path for path in paths if path is not None)
 
 
 def _intrinsics(folder: Path) -> Path | None:
@@ -63,7 +61,7 @@ def _intrinsics(folder: Path) -> Path | None:
 
 
 def _places(folder: Path) -> list[str]:
-    """The folder itself and its sequences, as they precede the names of what they hold."""
+    """Prefixes of names in the folder itself and in its sequences."""
     sequences = [
         name for name in os.listdir(folder) if name[:4] == "seq-" and (folder / name).is_dir()
     ]
@@ -71,16 +69,14 @@ def _places(folder: Path) -> list[str]:
 
 
 def _frames(folder: Path) -> list[tuple[str, str, set[str]]]:
-    """(name, colour image, files of its folder) of each frame, as POSIX paths below the folder, in
-    natural order.
-    """
+    """(name, colour image, files of its folder) of the frames, POSIX paths in natural order."""
     frames = []
     for place in _places(folder):
-        found = {place + name for name in os.listdir(folder / place)}
-        for image in common.printable(folder, filter(is_image, found)):
+        names = {place + name for name in os.listdir(folder / place)}
+        for image in common.printable(folder, filter(is_image, names)):
             name = common.stem(image)
             if name.endswith(".color") and name[len(place) :].startswith("frame-"):
-                frames.append((name.removesuffix(".color"), image, found))
+                frames.append((name.removesuffix(".color"), image, names))
     return sorted(frames, key=lambda frame: common.natural(frame[0]))
 
 

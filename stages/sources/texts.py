@@ -1,6 +1,4 @@
-"""Texts of a source: JSON objects, tables and matrices of numbers, each complete or named in an
-InputError.
-"""
+"""Texts of a source: JSON objects, tables and matrices; InputError names a file that is faulty."""
 
 from __future__ import annotations
 
@@ -32,29 +30,25 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def number(value: Any) -> float:
-    """A finite number that is written as one. Raises ValueError on text, true, null, inf, nan and
-    beyond float64.
-    """
+    """A finite number. Raises ValueError on text, true, null, inf, nan and beyond float64."""
     if isinstance(value, (int, float, np.number)) and not isinstance(value, bool):
         try:
-            if math.isfinite(found := float(value)):
-                return found
+            if math.isfinite(real := float(value)):
+                return real
         except OverflowError:
             pass
     raise ValueError(shortened(value))
 
 
 def whole(value: Any, least: int, most: int) -> int:
-    """A whole number that is written as one. Raises ValueError on anything else, and outside
-    least...most.
-    """
+    """A whole number in least...most. Raises ValueError on anything else."""
     if type(value) is not int or not least <= value <= most:
         raise ValueError(f"{shortened(value)} is no whole number in {least}...{most}")
     return value
 
 
 def shortened(value: Any) -> str:
-    """A value as a message repeats it: on one line, and not all of a long one."""
+    """A value for a message: on one line, and cut where long."""
     text = (
         f"{value:.6g}"
         if isinstance(value, float)
@@ -74,9 +68,7 @@ def read_rows(path: Path) -> list[list[str]]:
 
 
 def read_matrix(path: Path) -> np.ndarray:
-    """A 4x4 matrix in a text file of 3 or 4 rows, as float64; a 3x3 matrix or 3x4 rows are
-    completed. InputError.
-    """
+    """A 4x4 matrix f64 of a text file; 3x3 and 3x4 matrices are completed. Raises InputError."""
     try:
         rows = [[float(v) for v in row] for row in read_rows(path)]
     except ValueError as error:
@@ -91,14 +83,12 @@ def read_matrix(path: Path) -> np.ndarray:
 
 
 def skew_note(path: Path, K: np.ndarray) -> list[str]:
-    """A note on the skew of a matrix of intrinsics, which no camera here has; none where there is
-    none to speak of.
-    """
-    told = (
+    """A note on a skew in intrinsics that is not used; none below LEAST_SKEW."""
+    note = (
         f"{path.name} has a skew of {K[0, 1]:g} pixels, which is not used: pixels are taken as "
         "rectangular."
     )
-    return [told] if abs(K[0, 1]) > LEAST_SKEW else []
+    return [note] if abs(K[0, 1]) > LEAST_SKEW else []
 
 
 def read_table(path: Path, remedy: str) -> list[dict[str, str]]:

@@ -35,18 +35,21 @@ PERSPECTIVE = (
     "FULL_OPENCV",
 )
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-READ = {*PARTS, *SPLITS, *DISTORTION, "distortion_params", "transform_matrix", "camera_model", "is_fisheye", "fl_x",
-        "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y", "ply_file_path"}  # fmt: skip
+READ = {
+    *PARTS, *SPLITS, *DISTORTION, "distortion_params", "transform_matrix", "camera_model",
+    "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y",
+    "ply_file_path",
+}  # fmt: skip
 # of other programs' own use: a box to render in, how sharp a photo is, where poses came from
-OTHERS = {"aabb_scale", "scale", "offset", "sharpness", "colmap_im_id", "applied_transform", "applied_scale",
-          "rotation", "n_extra_learnable_dims"}  # fmt: skip
+OTHERS = {
+    "aabb_scale", "scale", "offset", "sharpness", "colmap_im_id", "applied_transform",
+    "applied_scale", "rotation", "n_extra_learnable_dims",
+}  # fmt: skip
 OPENGL = np.array([1.0, -1.0, -1.0, 1.0])  # y up, z backward -> y down, z forward
 
 
 class Entry(NamedTuple):
-    """A frame: the document that lists it, and its values, those that all frames share among
-    them.
-    """
+    """A frame: the document that lists it, and its values, with those that all frames share."""
 
     origin: Path
     values: dict[str, Any]
@@ -55,9 +58,9 @@ class Entry(NamedTuple):
 def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None) -> dict[str, Any]:
     """The fields of a capture; its labels are those of maps beside the document (`labels.give`).
 
-    Choices: the points of `ply_file_path` are taken unless there is depth, which gives more. Test
-      views are those of nerfstudio's lists (test and validation), or of transforms_test.json, of
-      transforms_val.json where there is none.
+    Choices: the points of `ply_file_path` are used unless there is depth, which gives more. Test
+      views are those of nerfstudio's lists (test and validation), or of transforms_test.json, else
+      of transforms_val.json.
     """
     entries = _entries(folder)
     listing = _listing(folder, entries)
@@ -71,10 +74,10 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
                 f"{cloud.name} holds {len(points)} points, too few: it is not used."
             )
         else:
-            kept = ~assembly.in_empty_space(points, fields, listing)
+            solid = ~assembly.in_empty_space(points, fields, listing)
             fields |= {
-                "points": points[kept],
-                "point_colors": None if colors is None else colors[kept],
+                "points": points[solid],
+                "point_colors": None if colors is None else colors[solid],
             }
     if tests is not None:
         assembly.give_split(fields, tests, origin)
@@ -82,7 +85,7 @@ def read(folder: Path, settings: Any, class_names: tuple[str, ...] | None = None
 
 
 def probe(folder: Path) -> dict[str, bool]:
-    """Light: reads the JSON, and asks which files exist only if it lists depth at all."""
+    """Reads the JSON, and looks for files only if it lists depth."""
     entries = _entries(folder)
     depth = any(entry.values.get("depth_file_path") for entry in entries)
     if depth:
@@ -92,9 +95,7 @@ def probe(folder: Path) -> dict[str, bool]:
 
 
 def files(folder: Path) -> list[Path]:
-    """The JSON, the points, label maps and their names, and every image, depth and mask of a frame
-    that is on disk.
-    """
+    """The JSON, points, label maps and names, and images, depth and masks of frames on disk."""
     entries = _entries(folder)
     present, _ = _present(folder, entries)
     beside = [
@@ -117,17 +118,15 @@ def files(folder: Path) -> list[Path]:
 
 
 def _documents(folder: Path) -> list[Path]:
-    """transforms.json; otherwise those of training views and, of the first that there are, of test
-    views.
-    """
+    """transforms.json; otherwise those of training views and of test, or else validation, views."""
     one, *parts = [folder / name for name in NAMES]
-    if common.present(one) or not (found := [path for path in parts if common.present(path)]):
+    if common.present(one) or not (present := [path for path in parts if common.present(path)]):
         return [one]
-    return found[:2]
+    return present[:2]
 
 
 def _document(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """What all frames of a document share, and the frames as they are listed."""
+    """Values that all frames of a document share, and the list of frames."""
     shared = read_json(path)
     entries = shared.pop("frames", None)
     if not isinstance(entries, list) or not entries:
@@ -154,9 +153,9 @@ def _entries(folder: Path) -> list[Entry]:
 def _present(folder: Path, entries: list[Entry]) -> tuple[list[tuple[Entry, str]], list[str]]:
     """(entry, image) of the frames that are on disk; the paths of those that are not.
 
-    Raises: InputError if a path leads out of the folder, and no photo in it is meant.
-    Choices: a photo that is not where it is listed, or was on another machine, is one of the
-      others, of this name alone (`common.matched`).
+    Raises: InputError if a path leads out of the folder and matches no photo in it.
+    Choices: a photo that is not at its listed path, as of another machine, is matched with one of
+      the others by name (`common.matched`).
     """
     paths = [_below(folder, entry.values["file_path"]) for entry in entries]
     images = {
@@ -165,7 +164,7 @@ def _present(folder: Path, entries: list[Entry]) -> tuple[list[tuple[Entry, str]
         if not _leads_out(path) and (image := _on_disk(os.path.join(folder, path)))
     }
     if absent := [path for path in paths if path not in images]:
-        taken = {
+        used = {
             *images.values(),
             *(str(_part(folder, entry, part)) for entry in entries for part in PARTS[1:]),
         }
@@ -173,7 +172,7 @@ def _present(folder: Path, entries: list[Entry]) -> tuple[list[tuple[Entry, str]
             name
             for name in common.names_below(folder)
             if name.partition("/")[0] not in common.BESIDE
-            and os.path.join(folder, name) not in taken
+            and os.path.join(folder, name) not in used
         ]
         images |= {
             path: os.path.join(folder, name)
@@ -195,7 +194,7 @@ def _present(folder: Path, entries: list[Entry]) -> tuple[list[tuple[Entry, str]
 
 
 def _on_disk(path: str) -> str | None:
-    """The file itself, or with an image suffix where the listing leaves it away."""
+    """The file itself, or with an image suffix that the listing omits."""
     paths = [path + end for end in ("", ".png", ".jpg", ".jpeg")]
     return next(
         (
@@ -302,7 +301,7 @@ def _listing(folder: Path, entries: list[Entry]) -> Listing:
 
 
 def _unused(folder: Path, entries: list[Entry], frames: list[Frame]) -> list[str]:
-    """Notes on what documents hold, or lies beside them, and is not read."""
+    """Notes on keys of the documents, and files beside them, that are not read."""
     notes, name = [], entries[0].origin.name
     if unknown := sorted(set().union(*(entry.values for entry in entries)) - READ - OTHERS):
         notes.append(f"Not read of {name}: {', '.join(map(shortened, unknown))}.")
@@ -317,13 +316,15 @@ def _unused(folder: Path, entries: list[Entry], frames: list[Frame]) -> list[str
 
 
 def _split(folder: Path, entries: list[Entry], listing: Listing) -> tuple[set[str] | None, str]:
-    """Names of the test views and what says so, None where nothing does; frames of no list leave
-    the listing.
+    """Names of the test views and the key or file that lists them, None without one; drops frames
+    of no list from the listing.
     """
     documents = _documents(folder)
     if len(documents) == 2:
-        held = [entry for entry, _ in _present(folder, entries)[0] if entry.origin == documents[1]]
-        return {_name(entry.values["file_path"]) for entry in held}, documents[1].name
+        test_entries = [
+            entry for entry, _ in _present(folder, entries)[0] if entry.origin == documents[1]
+        ]
+        return {_name(entry.values["file_path"]) for entry in test_entries}, documents[1].name
     lists: dict[str, set[str]] = {}
     for key in SPLITS:
         listed = entries[0].values.get(key)
@@ -347,9 +348,7 @@ def _split(folder: Path, entries: list[Entry], listing: Listing) -> tuple[set[st
 
 
 def _camera(values: dict[str, Any], image: Path, path: Path) -> Camera:
-    """The camera of one frame. Raises InputError on a lens that is not supported, or no focal
-    length.
-    """
+    """The camera of one frame. Raises InputError on an unsupported lens, or no focal length."""
     named = values.get("camera_model")
     model = (
         "OPENCV_FISHEYE"
@@ -361,8 +360,7 @@ def _camera(values: dict[str, Any], image: Path, path: Path) -> Camera:
     if model not in PERSPECTIVE + FISHEYE:
         raise InputError(
             f"{path}: camera_model {model} is not supported ({', '.join(PERSPECTIVE + FISHEYE)} "
-            "are); undistort the "
-            "photos first, for example with `colmap image_undistorter`"
+            "are); undistort the photos first, for example with `colmap image_undistorter`"
         )
     size = (values["w"], values["h"]) if "w" in values and "h" in values else header(image)[0]
     try:
@@ -379,7 +377,7 @@ def _camera(values: dict[str, Any], image: Path, path: Path) -> Camera:
         ) from None
     if fx is None or fy is None:
         raise InputError(f"{path} has neither fl_x nor camera_angle_x; write it again")
-    given = {key for key, value in k.items() if value}
+    nonzero = {key for key, value in k.items() if value}
     kind = "FULL_OPENCV"
     used: tuple[str, ...] = DISTORTION
     if model in FISHEYE:
@@ -387,12 +385,11 @@ def _camera(values: dict[str, Any], image: Path, path: Path) -> Camera:
     # whose k4 is OpenCV's; nerfstudio means another, which it does not undo either
     elif model != "FULL_OPENCV":
         used = DISTORTION[:5]
-        kind = "FULL_OPENCV" if "k3" in given else "OPENCV" if given else "PINHOLE"
-    if beyond := sorted(given - set(used)):
+        kind = "FULL_OPENCV" if "k3" in nonzero else "OPENCV" if nonzero else "PINHOLE"
+    if beyond := sorted(nonzero - set(used)):
         raise InputError(
-            f"{path}: {beyond[0]} of a camera {model} is not supported; write FULL_OPENCV if it "
-            "is OpenCV's, or "
-            "undistort the photos first"
+            f"{path}: {beyond[0]} of a camera {model} is not supported; write FULL_OPENCV if it is "
+            "OpenCV's, or undistort the photos first"
         )
     lens = [k[key] for key in (used if model in FISHEYE else DISTORTION)]
     return cameras.camera_of(

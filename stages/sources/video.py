@@ -1,6 +1,4 @@
-"""The video source: one file, or a folder that holds one and no photos. Poses come from the stage
-`pose`.
-"""
+"""The video source: one file, or a folder with one and no photos. The stage `pose` finds poses."""
 
 from __future__ import annotations
 
@@ -23,21 +21,20 @@ from chebsplat.stages.sources.colmap import points_of
 from chebsplat.stages.sources.colmap_model import Cloud
 from chebsplat.stages.sources.common import Shot, file_of
 
-MOST, LEAST = 150, 3  # frames: where pose.max_views says nothing, and that a scene needs
+MOST, LEAST = 150, 3  # frames: at most without pose.max_views, and at least
 # pixels of the longer side, on which sharpness and movement are measured
 SIDE, THUMBNAIL = 640, 192
 
 
 def shots(
-    path: Path, settings: PoseSection, shown: Progress | None, finer: int
+    path: Path, settings: PoseSection, reporter: Progress | None, finer: int
 ) -> tuple[list[Shot], list[str]]:
     """The frames to pose, named by their time in seconds, and notes about them.
 
     Args:    finer: so many frames in place of one.
     Raises:  InputError where the video cannot be read; DataFailure where its picture hardly moves;
-      ConfigError where it
-             is asked to show all directions.
-    Choices: the file is decoded anew whenever frames are taken, since they do not fit into memory.
+      ConfigError on pose.camera EQUIRECTANGULAR.
+    Choices: the file is decoded anew whenever frames are read, since they do not fit into memory.
     """
     (file,) = files(path)
     if settings.camera == cameras.EQUIRECTANGULAR:
@@ -45,18 +42,16 @@ def shots(
             "pose.camera EQUIRECTANGULAR is of photos: take frames of the video as photos"
         )
     video = videos.describe(file)
-    times, sharpness, moves = _measured(file, video, shown)
+    times, sharpness, moves = _measured(file, video, reporter)
     at_most = settings.max_views or finer * MOST
-    taken = choose(progress(moves, STEP / finer), sharpness, at_most)
-    if len(taken) < LEAST:
+    rows = choose(progress(moves, STEP / finer), sharpness, at_most)
+    if len(rows) < LEAST:
         raise DataFailure(
             f"{file}: its picture moves by {progress(moves)[-1]:.1f} steps of 7.5 % of its width, "
-            "which gives "
-            f"{len(taken)} views; {LEAST} are needed: walk around what is filmed"
+            f"which gives {len(rows)} views; {LEAST} are needed: walk around what is filmed"
         )
     notes = [
-        f"{len(taken)} of {len(times)} frames are used, one for each time that the picture moves "
-        "by "
+        f"{len(rows)} of {len(times)} frames are used, one for each time that the picture moves by "
         f"{STEP / finer:.1%} of its width, or fewer: at most {at_most} (pose.max_views)."
     ]
     if video.hdr:
@@ -65,22 +60,20 @@ def shots(
             "or convert it."
         )
     size = video.width, video.height
-    return [Shot(f"{times[k]:08.3f}", file, size, frame=int(k)) for k in taken], notes
+    return [Shot(f"{times[k]:08.3f}", file, size, frame=int(k)) for k in rows], notes
 
 
-def save(found: Sequence[Shot], _: Path, pictures: Path, max_side: int) -> None:
+def save(frames: Sequence[Shot], _: Path, pictures: Path, max_side: int) -> None:
     """Write frames, reduced until no side exceeds `max_side`."""
-    row = {shot.frame: k for k, shot in enumerate(found)}
-    for number, image in _taken(found[0].path, set(row)):
-        size = found[0].reduced(max_side)
+    row = {shot.frame: k for k, shot in enumerate(frames)}
+    for number, image in _read_frames(frames[0].path, set(row)):
+        size = frames[0].reduced(max_side)
         small = image if image.size == size else image.resize(size, Image.Resampling.BOX)
         small.save(pictures / file_of(row[number]), compress_level=1)
 
 
 def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, Any]:
-    """The fields of a capture: the frames of a model, without what the lens bends, and its
-    points.
-    """
+    """The fields of a capture: the frames of a model, undistorted, and its points."""
     (file,) = files(path)
     camera = cameras.camera_of(file, *model.cameras[0])
     view = assembly.geometry(camera, settings.max_side)
@@ -92,16 +85,16 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
     if view.factor < 1:
         notes.append(f"Images are reduced by {view.factor:.3f} (ingest.max_side).")
     named = {model.frames[row]: model.names[row] for row in rows}
-    images, kept, step = [], [], max(len(named) // assembly.COMPARED, 1)
-    for k, (_, image) in enumerate(_taken(file, set(named))):
+    images, shares, step = [], [], max(len(named) // assembly.COMPARED, 1)
+    for k, (_, image) in enumerate(_read_frames(file, set(named))):
         images.append(assembly.resampled(image, camera, view, at))
         if k % step == 0:
-            kept.append(assembly.variance_kept(image, images[-1], at))
+            shares.append(assembly.variance_kept(image, images[-1], at))
 
-    def altered(wanted: set[str]) -> Iterator[tuple[str, cameras.Camera, Any]]:
+    def altered(names: set[str]) -> Iterator[tuple[str, cameras.Camera, Any]]:
         changed = camera.model in cameras.DISTORTED or view.factor < 1
-        numbers = {frame for frame, name in named.items() if name in wanted and changed}
-        return ((named[frame], camera, image) for frame, image in _taken(file, numbers))
+        numbers = {frame for frame, name in named.items() if name in names and changed}
+        return ((named[frame], camera, image) for frame, image in _read_frames(file, numbers))
 
     fields = {
         "names": list(named.values()),
@@ -110,7 +103,7 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
         "cam_from_world": model.cam_from_world[rows],
         "source": {"kind": "video", "notes": notes},
         "altered": altered,
-        "variance_kept": float(np.mean(kept)),
+        "variance_kept": float(np.mean(shares)),
     }
     return fields | points_of(
         Cloud(model.points, model.colors, model.errors, model.tracks), model.names, fields
@@ -118,7 +111,7 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
 
 
 def probe(path: Path) -> dict[str, bool]:
-    """What a video brings beside its frames: nothing."""
+    """A video has neither poses, depth nor labels."""
     return {"poses": False, "depth": False, "labels": False}
 
 
@@ -126,54 +119,52 @@ def files(path: Path) -> list[Path]:
     """The video. Raises InputError where there is none, or several."""
     if not path.is_dir():
         return [path]
-    found = sorted(name for name in os.listdir(path) if videos.is_video(name))
-    if len(found) != 1:
+    names = sorted(name for name in os.listdir(path) if videos.is_video(name))
+    if len(names) != 1:
         raise InputError(
-            f"{path} holds {len(found)} videos, one is read at a time; name its file as scene="
+            f"{path} holds {len(names)} videos, one is read at a time; name its file as scene="
         )
-    return [path / found[0]]
+    return [path / names[0]]
 
 
 def _measured(
-    file: Path, video: videos.Video, shown: Progress | None
+    file: Path, video: videos.Video, reporter: Progress | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each frame its time in s [F], its sharpness [F] and the moves of its blocks [F, B, 2] in
-    widths.
-    """
+    """Times of the frames, s [F], sharpness [F], and moves of their blocks [F, B, 2] in widths."""
     times: list[float | None] = []
     sharpness, moves, before = [], [], None
     frames: Any = videos.frames(file)
-    if shown is not None:
+    if reporter is not None:
         frames = (
             item
-            for item, _ in shown.track(frames, lambda: max(video.n_frames, len(times)), "frames")
+            for item, _ in reporter.track(frames, lambda: max(video.n_frames, len(times)), "frames")
         )
     for frame in frames:
         small = _thumbnail(frame.pixels(THUMBNAIL))
-        found = shifts(small if before is None else before, small)
+        offsets = shifts(small if before is None else before, small)
         times.append(frame.time)
         sharpness.append(laplacian_variance(frame.pixels(SIDE)))
-        moves.append(found / small.shape[1])
+        moves.append(offsets / small.shape[1])
         before = small
-    given = np.array([np.nan if time is None else time for time in times])
+    stamps = np.array([np.nan if time is None else time for time in times])
     if (
-        not np.isfinite(given).all() or (np.diff(given) < 0.001).any()
+        not np.isfinite(stamps).all() or (np.diff(stamps) < 0.001).any()
     ):  # none, or damaged: then frames are evenly spaced
-        given = np.arange(len(times)) / video.rate
-    return given - given[0], np.array(sharpness), np.stack(moves)
+        stamps = np.arange(len(times)) / video.rate
+    return stamps - stamps[0], np.array(sharpness), np.stack(moves)
 
 
 def _thumbnail(grey: np.ndarray) -> np.ndarray:
-    """A picture that no side of is shorter than a block: its border is repeated."""
+    """A picture padded to the size of a block at least, by repeating its border."""
     lack = [max(BLOCK - side, 0) for side in grey.shape]
     return np.pad(grey, [(0, lack[0]), (0, lack[1])], mode="edge")
 
 
-def _taken(file: Path, wanted: set[int]) -> Iterator[tuple[int, Any]]:
+def _read_frames(file: Path, numbers: set[int]) -> Iterator[tuple[int, Any]]:
     """The frames of these numbers, each with its number, as RGB images."""
-    left = len(wanted)
+    left = len(numbers)
     for k, frame in enumerate(videos.frames(file) if left else ()):
-        if k in wanted:
+        if k in numbers:
             yield k, Image.fromarray(frame.pixels())
             left -= 1
         if not left:

@@ -1,8 +1,8 @@
-"""Labels of a capture with depth by volumes that a file describes, instead of a map for each view.
+"""Labels of a capture with depth by volumes in a file, instead of a map for each view.
 
 The file is JSON: `frame`, 3 rows of 4 that bring a point of the source's world into the room, z up;
 `margin`, in its unit; `volumes`, each with a `name`, a convex `polygon` of [x, y] and a `height` of
-[bottom, top]. What else it says is for people.
+[bottom, top]. Other keys are ignored.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from chebsplat.stages.sources import labels, texts
 
 
 def give(fields: dict[str, Any], path: Path) -> None:
-    """Give the fields of a capture the labels of the volumes that hold what its pixels show, -1
-    where none does or depth is unknown.
+    """Give the fields of a capture labels by the volumes that hold its pixels' points, -1 where
+    none does or depth is unknown.
 
     Raises: ConfigError where the source has no depth with poses, InputError naming the file.
     """
@@ -56,8 +56,8 @@ def read(path: Path) -> tuple[np.ndarray, float, list[str], list[Volume]]:
             bottom, top = map(texts.number, entry["height"])
             volumes.append(prism(numbers(entry["polygon"], (-1, 2)), bottom, top))
     except (KeyError, TypeError, ValueError) as error:
-        told = str(error)[: texts.LONGEST]
-        raise InputError(f"{path}: {where}: {told}; correct it (docs/usage.md)") from None
+        reason = str(error)[: texts.LONGEST]
+        raise InputError(f"{path}: {where}: {reason}; correct it (docs/usage.md)") from None
     return frame, margin, names, volumes
 
 

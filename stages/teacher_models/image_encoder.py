@@ -1,6 +1,4 @@
-"""A teacher's image encoder in ONNX, `[1, 3, H, W]` float32 -> `[1, C, h, w]`: windows, scales and
-flips of a view.
-"""
+"""Inference of a teacher's ONNX image encoder over windows, scales and flips of a view."""
 
 from __future__ import annotations
 
@@ -21,15 +19,16 @@ from chebsplat.stages.teacher_models.onnx_session import Model
 
 log = logging.getLogger("chebsplat")
 MAX_WINDOWS = 4096  # of a view
-JUDGED = 4  # images whose values tell what a segmenter gives
+SHARED = 8  # images that tell how common a segmenter's classes are
+JUDGED = 4  # images by which the kind of a segmenter's values is judged
 MAX_SHARE = 0.5  # of the image's side that an entry of the map may be wide
 
 
 class TeacherInference:
-    """Runs one teacher, one window at a time: on a CPU a batch gains nothing, and memory stays that
-    of one window.
+    """One teacher, `[1, 3, H, W]` float32 -> `[1, C, h, w]`, run window by window: on a CPU a batch
+    gains nothing.
 
-    scores: what the values of a segmenter are, once `judge` has seen some.
+    scores: kind of a segmenter's values, set by `judge`.
     Args: threads: that onnxruntime may use; device: cpu, or cuda where onnxruntime has it.
     Raises: InputError naming a model that cannot be used.
     """
@@ -46,8 +45,8 @@ class TeacherInference:
         self.model = Model(teacher.path, remedy, options, device)
         self.size = self._window_size()
         self.scores = LOGITS
-        self._place: int | None = None  # of the output that is read, once some are seen
-        self._last = False  # its channels come last
+        self._place: int | None = None  # of the output that is the map, from the first run on
+        self._last = False  # true where its channels come last
 
     def _window_size(self) -> tuple[int, int] | None:
         """(H, W) of the graph or of the TOML; None where the model takes any size."""
@@ -76,8 +75,7 @@ class TeacherInference:
         if self.teacher.size not in (None, fixed):
             raise InputError(
                 f"{path} takes {list(fixed)}, {self.teacher.settings} says size = "
-                f"{list(self.teacher.size or ())}; "
-                "correct it"
+                f"{list(self.teacher.size or ())}; correct it"
             )
         return fixed[0], fixed[1]
 
@@ -89,15 +87,12 @@ class TeacherInference:
         if max(size) > MAX_SIDE:
             raise InputError(
                 f"{self.teacher.settings}: an image of {size[1]} x {size[0]} is beyond {MAX_SIDE} "
-                "pixels a side; lower "
-                "`base` or teacher.scales"
+                "pixels a side; lower `base` or teacher.scales"
             )
         return size
 
     def window(self, size: tuple[int, int]) -> tuple[int, int]:
-        """What the model is fed of an image of a size: the model's size, or the image's own up to a
-        multiple.
-        """
+        """Size of the model's input for an image: fixed, or the image's up to a multiple."""
         if self.size is not None:
             return self.size
         height, width = (
@@ -117,8 +112,8 @@ class TeacherInference:
         if count > MAX_WINDOWS or max(side) > MAX_SIDE:
             raise InputError(
                 f"{self.teacher.settings}: a view takes {count:,} windows of {side[1]} x "
-                f"{side[0]}; {MAX_WINDOWS:,} of "
-                f"sides up to {MAX_SIDE} are possible: correct `base`, `size` or `multiple`"
+                f"{side[0]}; {MAX_WINDOWS:,} of sides up to {MAX_SIDE} are possible: correct "
+                "`base`, `size` or `multiple`"
             )
         cells = self.run(
             _padded(self._resized(image, scaled), side)[: side[0], : side[1]], "the first view"
@@ -128,17 +123,14 @@ class TeacherInference:
             entry = max(window / count * n / m, downscale)
             if entry > MAX_SHARE * n:
                 raise InputError(
-                    f"{self.teacher.path} gives one feature every {entry:.0f} pixels, for views "
-                    f"of {n}; give larger "
-                    f"images, or `base` in {self.teacher.settings}"
+                    f"{self.teacher.path} gives one feature every {entry:.0f} pixels, for views of "
+                    f"{n}; give larger images, or `base` in {self.teacher.settings}"
                 )
             sides.append(math.ceil(n / entry - 1e-9))
         return (sides[0], sides[1]), cells.shape[0]
 
     def judge(self, images: Stack | list[np.ndarray]) -> None:
-        """Tell from a few of the images what a segmenter's values are; all later maps are read
-        so.
-        """
+        """Set `scores`, the kind of a segmenter's values, from a few of the images."""
         few = images[:: -(-len(images) // JUDGED)]
         self.scores = kind_of([self.run(self.middle(image), "a view") for image in few])
         if self.scores != LOGITS:
@@ -148,10 +140,14 @@ class TeacherInference:
                 self.scores,
             )
 
+    def class_shares(self, images: Stack | list[np.ndarray], grid: tuple[int, int]) -> np.ndarray:
+        """Mean probability [C] of a segmenter's classes in a few of the images."""
+        few = images[:: -(-len(images) // SHARED)]
+        maps = [self.features(image, grid, (1.0,), False, "a view") for image in few]
+        return np.asarray(np.mean([values.mean((0, 1)) for values in maps], 0))
+
     def middle(self, image: np.ndarray, side: tuple[int, int] | None = None) -> np.ndarray:
-        """The window in an image's middle, u8 [H, W, 3]. Args: side: its (H, W); None: the
-        usual.
-        """
+        """The window in an image's middle, u8 [H, W, 3]; side: its (H, W), None: the usual."""
         size = self.scaled_size(image, 1.0)
         side = side or self.window(size)
         resized = self._resized(image, size)
@@ -166,12 +162,11 @@ class TeacherInference:
         flips: bool,
         name: str,
     ) -> np.ndarray:
-        """The map f32 [h, w, C] of a view, u8 [H, W, 3]: unit features, or probabilities of a
-        closed set.
+        """The map f32 [h, w, C] of a view, u8 [H, W, 3]: unit features, or class probabilities.
 
-        Choices: every window's entries are unit (or probabilities) before windows are blended;
-          every scale's and flip's map counts the same in the mean, which is made unit again.
-          Padding repeats the image's edge.
+        Choices: every window's entries are normalised before windows are blended; every scale's and
+          flip's map has the same weight in the mean, which is normalised again. Padding repeats the
+          image's edge.
         """
         total = np.zeros(0)
         for scale in scales:
@@ -201,8 +196,7 @@ class TeacherInference:
         )
 
     def run(self, window: np.ndarray, name: str) -> np.ndarray:
-        """The model's output f32 [C, h, w] for one window u8 [H, W, 3]. `name` of the view is for
-        errors.
+        """The model's output f32 [C, h, w] for one window u8 [H, W, 3]; name: for errors.
 
         Raises: InputError on a model that does not run or gives another rank; DataFailure on
           non-finite values.
@@ -217,8 +211,8 @@ class TeacherInference:
         output = outputs[self._place]
         if output.dtype.kind in "iu" and (output.ndim == 3 or output.shape[1:2] == (1,)):
             raise InputError(
-                f"{teacher.path} gives the likeliest class alone, "
-                f"{list(output.shape)}; export its logits"
+                f"{teacher.path} gives the likeliest class alone, {list(output.shape)}; export its "
+                "logits"
             )
         if output.ndim != 4 or output.shape[0] != 1 or not output.size:
             raise InputError(
@@ -229,8 +223,7 @@ class TeacherInference:
         if not np.isfinite(output).all():
             raise DataFailure(
                 f"{teacher.path} gives {np.sum(~np.isfinite(output))} non-finite values for "
-                f"{name}; check mean and std "
-                f"in {teacher.settings}, and export it in float32"
+                f"{name}; check mean and std in {teacher.settings}, and export it in float32"
             )
         return output[0].astype(np.float32)
 
@@ -241,22 +234,24 @@ class TeacherInference:
         return np.asarray(Image.fromarray(image).resize((size[1], size[0]), how))
 
     def _place_of(self, outputs: list[np.ndarray]) -> tuple[int, bool]:
-        """Which of the graph's outputs is the map, and whether its channels come last: the one that
-        the TOML names, or that fits the labels.
+        """Index of the output that is the map, by the TOML's name or by the labels; true where its
+        channels come last.
 
-        Raises: InputError listing them where none or several do.
+        Raises: InputError listing the outputs where none or several fit.
         """
         teacher = self.teacher
         names = [entry.name for entry in self.model.outputs]
         listed = ", ".join(
             f"{name} {list(value.shape)}" for name, value in zip(names, outputs, strict=True)
         )
-        asked = [k for k, name in enumerate(names) if teacher.tensor in (None, name)]
-        if not asked:
+        requested = [k for k, name in enumerate(names) if teacher.tensor in (None, name)]
+        if not requested:
             why = f"no output is called {teacher.tensor}: there are {listed}"
             raise InputError(f"{teacher.settings}: {why}; correct `tensor`")
         maps = [
-            k for k in asked if outputs[k].ndim == 4 and len(outputs[k]) == 1 and outputs[k].size
+            k
+            for k in requested
+            if outputs[k].ndim == 4 and len(outputs[k]) == 1 and outputs[k].size
         ]
         table, embeddings = (
             ([], None) if teacher.labels is None else read_label_table(teacher.labels)
@@ -267,18 +262,18 @@ class TeacherInference:
         first, last = (
             [k for k in maps if n_channels in (None, outputs[k].shape[axis])] for axis in (1, 3)
         )
-        found = first or last
-        if len(found) == 1:
+        matches = first or last
+        if len(matches) == 1:
             if not first:
                 log.info(
                     "%s gives %s: channels come last, and are taken so", teacher.path.name, listed
                 )
-            elif len(asked) > 1:
-                log.info("%s gives %s: %s is taken", teacher.path.name, listed, names[found[0]])
-            return found[0], not first
-        if len(asked) == 1:  # which whoever needs the channels refuses
-            return asked[0], False
-        fit = f"{'more than one' if found else 'none'} fits {teacher.labels or '[1, C, h, w]'}"
+            elif len(requested) > 1:
+                log.info("%s gives %s: %s is taken", teacher.path.name, listed, names[matches[0]])
+            return matches[0], not first
+        if len(requested) == 1:  # a wrong number of channels is an error later, with its remedy
+            return requested[0], False
+        fit = f"{'more than one' if matches else 'none'} fits {teacher.labels or '[1, C, h, w]'}"
         raise InputError(
             f"{teacher.path} gives {listed}: {fit}; name the right one as `tensor` "
             f"in {teacher.settings}"
@@ -291,6 +286,6 @@ def unit(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _padded(image: np.ndarray, side: tuple[int, int]) -> np.ndarray:
-    """At least `side` large."""
+    """An image padded to `side` at least."""
     below, right = (max(side[k] - image.shape[k], 0) for k in (0, 1))
     return np.pad(image, ((0, below), (0, right), (0, 0)), "edge")

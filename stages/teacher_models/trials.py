@@ -1,6 +1,4 @@
-"""A teacher tried on photos in the usual other ways: what of its TOML, graph or names may be
-wrong.
-"""
+"""Trials of a teacher on photos, to detect errors of its TOML, graph or names."""
 
 from __future__ import annotations
 
@@ -21,7 +19,7 @@ from chebsplat.stages.teacher_models.label_space import IN_ROOMS
 
 IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 BYTE = (1 / 255,) * 3
-RANGES = {  # of colours that models are fed: mean and std
+RANGES = {  # usual ranges of models' input colours: mean and std
     "0 to 1": ((0.0,) * 3, (1.0,) * 3),
     "-1 to 1": ((0.5,) * 3, (0.5,) * 3),
     "ImageNet's mean and std": IMAGENET,
@@ -32,8 +30,8 @@ RANGES = {  # of colours that models are fed: mean and std
 # the information of any other; the right order 1.015 to 1.6 times less entropy; in rooms names have
 # a sense of 0.74 to 1.44, and one class off at most 0.15.
 MORE, LESS, SENSIBLE, BETTER = 1.1, 1.05, 0.7, 0.4
-ENOUGH = 4  # photos: of one alone, a wrong range may tell more
-LEAST = 0.02  # nats of information that tell anything
+ENOUGH = 4  # photos: on one alone a wrong range may be more informative
+LEAST = 0.02  # nats of information, below which there is no verdict
 CLEARLY = 1.2  # more change in one quarter than in any other
 GAMMA, INNER = 1.3, 8  # of the changed photo, and the eighth that it lacks on each side
 SATURATED = 1 - 1e-6, 0.9  # a confidence, and the share of pixels that are surer
@@ -41,7 +39,7 @@ UNTOLD = "cannot be told from these photos"
 
 
 class Trials:
-    """What a teacher gives of the middle windows of photos, fed in one way or another."""
+    """Outputs of a teacher for the middle windows of photos, under variants of its input."""
 
     def __init__(self, network: TeacherInference, images: list[np.ndarray], embeddings: np.ndarray):
         self.network, self.own, self.embeddings = network, network.teacher, embeddings
@@ -50,12 +48,12 @@ class Trials:
         )
         self.windows = [network.middle(image, (min(heights), min(widths))) for image in images]
         self.turned = False
-        self.plain = self.fed(self.own)
+        self.plain = self.outputs(self.own)
 
-    def fed(
+    def outputs(
         self, teacher: TeacherModel, change: Callable[[np.ndarray], np.ndarray] | None = None
     ) -> np.ndarray:
-        """Values [V, L, h, w] of the windows, changed or not, by a teacher's mean, std, order."""
+        """Values [V, L, h, w] of the windows after `change`, by a teacher's mean, std, order."""
         self.network.teacher = teacher
         try:
             windows = [window if change is None else change(window) for window in self.windows]
@@ -70,12 +68,10 @@ class Trials:
             )
         return values.swapaxes(2, 3) if self.turned else values
 
-    def informed(self, teacher: TeacherModel) -> tuple[float, np.ndarray]:
-        """Information that photos share with their own middles, mirrored and darkened; the plain
-        values.
-        """
-        plain = self.plain if teacher == self.own else self.fed(teacher)
-        changed = self.fed(teacher, closer)[..., ::-1]
+    def measure(self, teacher: TeacherModel) -> tuple[float, np.ndarray]:
+        """Information, nats, that photos and their changed middles share; the values."""
+        plain = self.plain if teacher == self.own else self.outputs(teacher)
+        changed = self.outputs(teacher, closer)[..., ::-1]
         inner = [slice(n // INNER, n - n // INNER) for n in plain.shape[2:]]
         there = plain[:, :, inner[0], inner[1]]
         rows, columns = (
@@ -86,32 +82,36 @@ class Trials:
         return information(soft(there, spread(plain)), soft(same, spread(changed))), plain
 
 
-def tried(
+def try_variants(
     network: TeacherInference, images: list[np.ndarray], names: list[str], embeddings: np.ndarray
 ) -> list[tuple[str, str]]:
-    """(what, finding) about the map's layout, the range and order of colours, the names of classes.
+    """(topic, finding) on the map's layout, the range and order of colours, the names of classes.
 
     Args: names: of the channels of a segmenter, or of the rows of `embeddings` of other teachers.
     """
     trials = Trials(network, images, embeddings)
-    found = [("layout", layout_of(trials))]
+    findings = [("layout", layout_of(trials))]
     if len(images) < ENOUGH:
         return [
-            *found,
+            *findings,
             (
                 "more",
                 "with eight photos, or a folder, range and order of colours and "
                 "names are tried, too",
             ),
         ]
-    told, best, plain = range_of(trials)
-    found += [("range", told), ("order", order_of(trials, best, plain))]
-    return [*found, ("names", names_of(plain, names))] if trials.own.output == "logits" else found
+    finding, best, plain = range_of(trials)
+    findings += [("range", finding), ("order", order_of(trials, best, plain))]
+    return (
+        [*findings, ("names", names_of(plain, names))]
+        if trials.own.output == "logits"
+        else findings
+    )
 
 
 def layout_of(trials: Trials) -> str:
-    """Where in the map a change of the photos' top right is seen. A transposed map is turned."""
-    before, after = trials.plain, trials.fed(trials.own, top_right_inverted)
+    """Finding on the map's layout, by a change of the photos' top right; turns a transposed map."""
+    before, after = trials.plain, trials.outputs(trials.own, top_right_inverted)
     deviation = spread(before)
     moved = changes(soft(before, deviation), soft(after, deviation))
     second, first = np.argsort(moved)[-2:]
@@ -130,23 +130,25 @@ def layout_of(trials: Trials) -> str:
 
 
 def range_of(trials: Trials) -> tuple[str, TeacherModel, np.ndarray]:
-    """What is said of mean and std; the teacher as it tells most; its values."""
+    """Finding on mean and std; the teacher with the most informative ones; its values."""
     teacher = trials.own
-    own, plain = trials.informed(teacher)
-    found = []
+    own, plain = trials.measure(teacher)
+    candidates = []
     for name, (mean, std) in RANGES.items():
         if not np.allclose((mean, std), (teacher.mean, teacher.std), rtol=0.05):
             fed = replace(teacher, mean=mean, std=std)
             with suppress(DataFailure):  # a range that makes it overflow
-                found.append((*trials.informed(fed), name, fed))
-    most, values, name, best = max(found, key=lambda of: of[0], default=(0.0, plain, "", teacher))
-    kept = "nats outlive a change of the photos"
+                candidates.append((*trials.measure(fed), name, fed))
+    most, values, name, best = max(
+        candidates, key=lambda of: of[0], default=(0.0, plain, "", teacher)
+    )
+    measure = "nats outlive a change of the photos"
     if most > max(MORE * own, LEAST):
-        said = f"{name} tells more: {most:.2f} {kept}, {own:.2f} as given"
+        verdict = f"{name} tells more: {most:.2f} {measure}, {own:.2f} as given"
         right = ", ".join(
             f"{key} = {[round(v, 6) for v in getattr(best, key)]}" for key in ("mean", "std")
         )
-        return f"{said}; try {right} in {teacher.settings.name}", best, values
+        return f"{verdict}; try {right} in {teacher.settings.name}", best, values
     sure = probabilities(np.moveaxis(plain, 1, 0), LOGITS).max(0)
     if teacher.output == "logits" and (sure > SATURATED[0]).mean() > SATURATED[1]:
         why = (
@@ -155,21 +157,21 @@ def range_of(trials: Trials) -> tuple[str, TeacherModel, np.ndarray]:
         )
         return f"sure of everything, {why}", teacher, plain
     if own < LEAST or own < MORE * most:
-        return f"{UNTOLD}: {own:.2f} {kept}, {most:.2f} in another range", teacher, plain
-    return f"as given: {own:.2f} {kept}, at most {most:.2f} in others", teacher, plain
+        return f"{UNTOLD}: {own:.2f} {measure}, {most:.2f} in another range", teacher, plain
+    return f"as given: {own:.2f} {measure}, at most {most:.2f} in others", teacher, plain
 
 
 def order_of(trials: Trials, teacher: TeacherModel, plain: np.ndarray) -> str:
-    """What is said of the order of colours."""
+    """Finding on the order of colours."""
     other = {"RGB": "BGR", "BGR": "RGB"}[teacher.order]
     deviation = spread(plain)
     own, swapped = (
         entropy(soft(values, deviation))
-        for values in (plain, trials.fed(replace(teacher, order=other)))
+        for values in (plain, trials.outputs(replace(teacher, order=other)))
     )
     if own > LESS * swapped:
-        said = f"{other} is surer: {swapped:.3f} nats of doubt, {own:.3f} of {teacher.order}"
-        return f'{said}; try order = "{other}" in {teacher.settings.name}'
+        verdict = f"{other} is surer: {swapped:.3f} nats of doubt, {own:.3f} of {teacher.order}"
+        return f'{verdict}; try order = "{other}" in {teacher.settings.name}'
     return (
         f"{teacher.order}: {own:.3f} nats of doubt, {swapped:.3f} of {other}"
         if swapped > LESS * own
@@ -178,7 +180,7 @@ def order_of(trials: Trials, teacher: TeacherModel, plain: np.ndarray) -> str:
 
 
 def names_of(plain: np.ndarray, names: list[str]) -> str:
-    """What is said of the names of classes: of one class more or less in front, nothing else."""
+    """Finding on the names of classes: off by one or not, nothing else."""
     shares = soft(plain, spread(plain))
     words = [folded(name.replace(",", " ").replace(";", " ")) for name in names]
     indoors = frozenset(word for name in IN_ROOMS for word in name.split())
@@ -192,9 +194,11 @@ def names_of(plain: np.ndarray, names: list[str]) -> str:
     if by == 0:
         return f"make sense of a room ({off[0]:.2f} of 2)"
     which = "after" if by < 0 else "before"
-    said = f"one class off, if these are rooms: each makes more sense with the name {which} its own"
-    asked = "is a background named that the model has not, or the other way round?"
-    return f"{said} ({off[by]:.2f} of 2, {off[0]:.2f} as given); {asked}"
+    verdict = (
+        f"one class off, if these are rooms: each makes more sense with the name {which} its own"
+    )
+    question = "is a background named that the model has not, or the other way round?"
+    return f"{verdict} ({off[by]:.2f} of 2, {off[0]:.2f} as given); {question}"
 
 
 def closer(window: np.ndarray) -> np.ndarray:

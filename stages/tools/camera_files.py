@@ -1,8 +1,7 @@
-"""Cameras in other programs' files: COLMAP's text model, nerfstudio's transforms.json, 3DGS'
-cameras.json.
+"""Cameras in other programs' files: COLMAP's text model, transforms.json, 3DGS' cameras.json.
 
-World, units and pixel centres (half integers) are those of the scene; only axes change, and only
-where a format has its own. Images are called by the view's name and .png.
+World, units and pixel centres (half integers) are those of the scene; axes are those of each
+format. Images are named by the view with .png.
 """
 
 from __future__ import annotations
@@ -29,8 +28,7 @@ AGAIN = "write it again"
 
 
 def write_cameras(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
-    """Write cameras in the three forms: sparse/0 (COLMAP), transforms.json, cameras.json; returns
-    what was written.
+    """Write cameras as sparse/0 (COLMAP), transforms.json and cameras.json; returns the files.
 
     Raises: ConfigError if one of them exists.
     """
@@ -48,9 +46,7 @@ def write_cameras(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
 
 
 def colmap_texts(cameras: Sequence[Camera]) -> dict[str, str]:
-    """COLMAP's text model by file: one PINHOLE camera for each lens and size, no keypoints, no
-    points.
-    """
+    """COLMAP's text model by file: a PINHOLE camera for each lens and size, no points."""
     lenses: dict[tuple[float, ...], int] = {}
     images = [
         "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then keypoints, of which there are none"
@@ -85,7 +81,7 @@ def transforms(cameras: Sequence[Camera]) -> dict[str, Any]:
 
 def gs_cameras(cameras: Sequence[Camera]) -> list[dict[str, Any]]:
     """3DGS' list: position and axes of the camera in the world, OpenCV's. Choices: cx, cy, which
-    the format takes to be the middle, are added; readers that know no such key pass over it.
+    the format assumes in the middle, are added; readers ignore unknown keys.
     """
     rows = []
     for index, camera in enumerate(cameras):
@@ -100,10 +96,9 @@ def gs_cameras(cameras: Sequence[Camera]) -> list[dict[str, Any]]:
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """The pinhole cameras of a transforms.json or a cameras.json, in its order; a lens's distortion
-    is left away.
+    """The pinhole cameras of a transforms.json or cameras.json, in order; distortion is dropped.
 
-    Raises: InputError naming the file and what of it cannot be used.
+    Raises: InputError naming the file and its unusable part.
     """
     document = parse_json(path)
     if isinstance(document, dict) and isinstance(document.get("frames"), list):
@@ -122,13 +117,13 @@ def _read(
 ) -> list[Camera]:
     if not entries or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(f"{path} lists no cameras, or something else; {AGAIN}")
-    found = [read(entry) for entry in entries]
-    names = [name for name, _, _ in found]
-    poses = cam_from_world(path, np.stack([matrix for _, matrix, _ in found]), names)
+    parsed = [read(entry) for entry in entries]
+    names = [name for name, _, _ in parsed]
+    poses = cam_from_world(path, np.stack([matrix for _, matrix, _ in parsed]), names)
     if not np.isfinite(poses).all():
         raise InputError(f"{path}: a pose is not finite; {AGAIN}")
     cameras = []
-    for (name, _, lens), pose in zip(found, poses, strict=True):
+    for (name, _, lens), pose in zip(parsed, poses, strict=True):
         fx, fy, cx, cy = lens.pinhole
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
         cameras.append(Camera(name, K, pose, lens.width, lens.height))
@@ -136,9 +131,7 @@ def _read(
 
 
 def _transforms_camera(path: Path, entry: dict[str, Any]) -> tuple[str, np.ndarray, Any]:
-    """Name, camera-to-world [4, 4] in OpenCV's axes, and lens of a frame; its image need not be
-    there.
-    """
+    """Name, camera-to-world [4, 4] in OpenCV's axes, and lens of a frame."""
     with _usable(path):
         width, height = number(entry["w"]), number(entry["h"])
         angled = "fl_x" not in entry
@@ -174,7 +167,7 @@ def _gs_camera(path: Path, entry: dict[str, Any]) -> tuple[str, np.ndarray, Any]
 
 @contextmanager
 def _usable(path: Path) -> Iterator[None]:
-    """Say which file it is that lacks a value, or holds one that is none."""
+    """Turn errors of a missing or malformed value into an InputError that names the file."""
     try:
         yield
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:

@@ -1,4 +1,4 @@
-"""Part of a finished scene as one splat: chosen by words, label, opacity and box."""
+"""Part of a finished scene as one splat, selected by words, label, opacity and box."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.formats.scene import Scene
 from chebsplat.splats.parts import substantial
 from chebsplat.stages.tools.query import Query
-from chebsplat.stages.tools.scene import OpenedScene, passing
+from chebsplat.stages.tools.scene import OpenedScene, filter_masks
 
 
 def extract(
@@ -27,13 +27,13 @@ def extract(
       out:         the splat to write, as of `OpenedScene.export`.
       labels:      names to keep; all where there are none.
       min_opacity: activated, in [0, 1]; box: x0, y0, z0, x1, y1, z1 of centres, scene units.
-      query:       what its cut selects, in the parts that hang together; None: all.
-    Returns: how many Gaussians were kept, and how many each filter alone would leave out.
+      query:       selects the connected parts above its cut; None: all.
+    Returns: number of Gaussians written, and of those that each filter alone leaves out.
     Raises:  ConfigError on a filter that the scene cannot answer, DataFailure if nothing is left.
     """
-    filters = passing(scene.exported, scene.source, labels, min_opacity, box)
+    filters = filter_masks(scene.exported, scene.source, labels, min_opacity, box)
     if query is not None:
-        filters["query"] = asked_for(scene.exported, query)
+        filters["query"] = select_by_query(scene.exported, query)
     n = len(scene)
     part = scene.part(filters)
     part.export(out)
@@ -41,9 +41,9 @@ def extract(
     return {"kept": len(part), "of": n} | left_out
 
 
-def asked_for(scene: Scene, query: Query) -> np.ndarray:
-    """Which Gaussians the query selects, bool [N], crumbs apart. Raises DataFailure where it is
-    probably not here.
+def select_by_query(scene: Scene, query: Query) -> np.ndarray:
+    """Mask [N] of the Gaussians above the query's cut, without small isolated groups. Raises
+    DataFailure where the scene probably has none.
     """
     answer = query.answer(scene.parameters["features"])
     if answer.present is False or not answer.selected.any():
@@ -54,7 +54,7 @@ def asked_for(scene: Scene, query: Query) -> np.ndarray:
 
 
 def corners(text: str | None) -> tuple[float, ...] | None:
-    """Numbers with commas between them. Raises ConfigError if they are none."""
+    """Numbers separated by commas. Raises ConfigError if they are none."""
     try:
         return None if text is None else tuple(float(part) for part in text.split(","))
     except ValueError:

@@ -1,5 +1,4 @@
-"""render: a finished scene as frames: colour, labels, depth, relevancy. A frame that is there and
-whole is kept.
+"""render: a finished scene as frames of colour, labels, depth, relevancy; whole frames are kept.
 
 A video of them is H.264 in MP4, through PyAV.
 """
@@ -20,6 +19,7 @@ import numpy as np
 from PIL import Image
 
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.extras import extra
 from chebsplat.formats.files import atomic_path, atomic_write, parse_json
 from chebsplat.formats.images import opened, read_rgb
 from chebsplat.labels.decode import decode_labels
@@ -33,15 +33,16 @@ log = logging.getLogger("chebsplat")
 KINDS = ("color", "labels", "depth", "relevancy")
 SEMANTIC = ("labels", "relevancy")
 REQUEST = "frames.json"
+EMPTY = 0.05  # of a frame that is covered, below which it shows next to nothing
+N_LOOKED_AT, SMALL = 60, 64  # frames of a path that are looked at before, pixels of a side
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk
-INSTALL = ".venv/bin/pip install -e '.[video]'"
-CRF = "18"  # x264's constant rate factor: hardly told from the frames by eye
+CRF = "18"  # x264's constant rate factor, visually almost lossless
 
 
 @dataclass(frozen=True)
 class Shot:
-    """What is rendered of every camera: kinds of KINDS; identity: of the scene, so that frames of
-    another are told apart; query: where relevancy is among the kinds.
+    """Kinds of frames (of KINDS) to render of every camera; identity of the scene, so that frames
+    of another are recognised; query, if relevancy is among the kinds.
     """
 
     kinds: tuple[str, ...]
@@ -49,18 +50,17 @@ class Shot:
     query: Query | None = None
 
 
-def kinds_of(text: str, scene: OpenedScene, asked: bool) -> tuple[str, ...]:
-    """The kinds in "color,depth". Raises ConfigError on one that is none, or that the scene or the
-    query cannot give.
+def kinds_of(text: str, scene: OpenedScene, has_query: bool) -> tuple[str, ...]:
+    """The kinds in "color,depth". Raises ConfigError on one that the scene or query cannot give.
 
-    Args: asked: whether there is a query.
+    Args: has_query: true where a query is given.
     """
     kinds = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
     if not kinds or set(kinds) - set(KINDS):
         raise ConfigError(f"--what {text}: one or more of {','.join(KINDS)} are needed")
-    if "relevancy" in kinds and not asked:
+    if "relevancy" in kinds and not has_query:
         raise ConfigError("--what relevancy needs --query TEXT")
-    if asked and "relevancy" not in kinds:
+    if has_query and "relevancy" not in kinds:
         raise ConfigError("--query is of relevancy; add relevancy to --what")
     if scene.labels is None and (missing := [kind for kind in kinds if kind in SEMANTIC]):
         raise ConfigError(
@@ -72,62 +72,80 @@ def kinds_of(text: str, scene: OpenedScene, asked: bool) -> tuple[str, ...]:
 def render_frames(
     scene: OpenedScene, cameras: Sequence[Camera], shot: Shot, out: Path, progress: Progress
 ) -> dict[str, list[Path]]:
-    """Render every camera's frames into OUT/<kind>/<view>.png (depth: .npy); those that are there
-    are kept.
+    """Render every camera's frames into OUT/<kind>/<view>.png (depth: .npy), unless they are there.
 
     Returns: the files of each kind, in the cameras' order.
     Raises:  ConfigError where `out` holds something else than frames of this request.
     Choices: colour is 8-bit RGB, as `evaluate` measures it. Labels are a palette PNG whose values
       are row of label_names + 1, 0 where a pixel is less than half covered; 16-bit grey without
       palette beyond 255 labels. Depth is float32 .npy, scene units along the camera's axis, nan
-      where nothing is: units are the source's own, and 16 bits of thousandths would cut or coarsen
-        what is no metre. Relevancy is the render under its heat.
+      where nothing is: units are the source's own, and 16-bit thousandths would clip or coarsen
+      units other than metres. Relevancy is the render under its heat.
     """
     names = file_names([f"{camera.name}.png" for camera in cameras])
     claim(out, cameras, shot, scene)
+    warn_of_empty(scene, cameras)
     files = {kind: [out / kind / f"{name}{ending(kind)}" for name in names] for kind in shot.kinds}
     missing = []
     for k, camera in enumerate(cameras):
         absent = tuple(kind for kind in shot.kinds if not whole(files[kind][k], camera))
         missing += [(k, absent)] if absent else []
-    done = len(cameras) - len(missing)
-    if done:
-        log.info("%d of %d frames are there and kept", done, len(cameras))
-    for (k, absent), _ in progress.track(missing, len(cameras), "render", start=done):
+    n_whole = len(cameras) - len(missing)
+    if n_whole:
+        log.info("%d of %d frames are there and kept", n_whole, len(cameras))
+    for (k, absent), _ in progress.track(missing, len(cameras), "render", start=n_whole):
         for kind, values in pictures(scene, cameras[k], shot, absent).items():
             with atomic_path(files[kind][k]) as temporary:
                 save(kind, values, temporary, len(scene.label_names or []))
     return files
 
 
-def file_names(views: list[str]) -> list[str]:
-    """A file's name for each view: its path with every separator replaced, and a number where two
-    would be alike.
+def warn_of_empty(scene: OpenedScene, cameras: Sequence[Camera]) -> None:
+    """Warn of the share of the frames of which less than 5 % is covered, before they are rendered.
+
+    Choices: of more than 60 every n-th is looked at, in a few pixels: a path shows much the same
+      in frames that follow each other.
     """
+    sample = cameras[:: -(-len(cameras) // N_LOOKED_AT)]
+    empty = 0
+    for camera in sample:
+        scale = min(SMALL / max(camera.width, camera.height), 1.0)
+        small = camera.resized(*(max(round(scale * s), 1) for s in (camera.width, camera.height)))
+        covered = scene.depth(scene.inside(small).view())[1] >= COVERED
+        empty += int(covered.mean() < EMPTY)
+    if empty:
+        log.warning(
+            "%.0f %% of the frames show next to nothing (less than %.0f %% of each is covered); "
+            "choose another --path",
+            100 * empty / len(sample),
+            100 * EMPTY,
+        )
+
+
+def file_names(views: list[str]) -> list[str]:
+    """A file name for each view: its path without separators, numbered where two coincide."""
     names: list[str] = []
     for view in views:
         name = re.sub(r"[^\w.-]+", "-", view.removesuffix(Path(view).suffix)).strip(".-") or "view"
         name = name.encode()[:200].decode(errors="ignore")
-        taken = {held.lower() for held in names}  # some file systems fold case
+        used_names = {used.lower() for used in names}  # some file systems fold case
         names.append(
             next(
                 new
                 for k in itertools.count(1)
-                if (new := name if k == 1 else f"{name}-{k}").lower() not in taken
+                if (new := name if k == 1 else f"{name}-{k}").lower() not in used_names
             )
         )
     return names
 
 
 def ending(kind: str) -> str:
-    """Of the files of a kind."""
+    """Suffix of the files of a kind."""
     return ".npy" if kind == "depth" else ".png"
 
 
 def claim(out: Path, cameras: Sequence[Camera], shot: Shot, scene: OpenedScene) -> None:
-    """Write down what the frames of `out` are of, or check that those that are there are of the
-    same.
-    """
+    """Record the request that the frames of `out` answer, or check that existing ones answer it."""
     request = {"scene": shot.identity, "labels": scene.label_names, "cameras": gs_cameras(cameras)}
     request |= {"query": None if shot.query is None else [shot.query.text, *shot.query.phrases]}
     path = out / REQUEST
@@ -144,7 +162,7 @@ def claim(out: Path, cameras: Sequence[Camera], shot: Shot, scene: OpenedScene) 
 
 
 def whole(path: Path, camera: Camera) -> bool:
-    """Whether a frame is there, readable to its last byte, and of the camera's size."""
+    """True where a frame is there, readable to its last byte, and of the camera's size."""
     if not path.is_file():
         return False
     size = camera.width, camera.height
@@ -152,7 +170,7 @@ def whole(path: Path, camera: Camera) -> bool:
         if path.suffix == ".npy":
             return bool(np.load(path, allow_pickle=False).shape == size[::-1])
         with opened(path) as image:
-            # its reader needs no end
+            # Pillow reads a file without its end
             return bool(image.size == size) and path.read_bytes().endswith(PNG_END)
     except (InputError, ValueError, OSError, EOFError) as error:
         log.warning("%s is rendered again: %s", path, error)
@@ -162,27 +180,25 @@ def whole(path: Path, camera: Camera) -> bool:
 def pictures(
     scene: OpenedScene, camera: Camera, shot: Shot, kinds: Sequence[str]
 ) -> dict[str, np.ndarray]:
-    """The arrays of these kinds: color and relevancy u8 [H, W, 3], labels i32 [H, W], depth f32 [H,
-    W].
-    """
+    """Arrays of these kinds: color, relevancy u8 [H, W, 3], labels i32 [H, W], depth f32 [H, W]."""
     from chebsplat.stages.pages.pictures import heat
 
     view, renderer = scene.inside(camera).view(), scene.renderer
-    found: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
     features = None
     if set(kinds) != {"depth"}:
-        found["color"], features = renderer.render(
+        arrays["color"], features = renderer.render(
             view, with_features=bool(set(kinds) & set(SEMANTIC))
         )
     if "depth" in kinds or "labels" in kinds:
-        found["depth"], alpha = scene.depth(view)
+        arrays["depth"], alpha = scene.depth(view)
         if "labels" in kinds and features is not None and scene.label_embeddings is not None:
-            found["labels"] = np.where(
+            arrays["labels"] = np.where(
                 alpha < COVERED, -1, decode_labels(features, scene.label_embeddings)
             )
     if "relevancy" in kinds and features is not None and shot.query is not None:
-        found["relevancy"] = heat(found["color"], shot.query.scores(features))
-    return {kind: found[kind] for kind in kinds}
+        arrays["relevancy"] = heat(arrays["color"], shot.query.scores(features))
+    return {kind: arrays[kind] for kind in kinds}
 
 
 def save(kind: str, values: np.ndarray, path: Path, n_labels: int) -> None:
@@ -203,15 +219,8 @@ def save(kind: str, values: np.ndarray, path: Path, n_labels: int) -> None:
         image.save(path, "PNG")
 
 
-def shown(kind: str, path: Path, far: float) -> np.ndarray:
-    """A frame as a picture u8 [H, W, 3] for people; far: scene units, where depth is darkest."""
-    return read_rgb(path) if kind != "depth" else depth_colors(np.load(path), far)
-
-
 def depth_colors(depth: np.ndarray, far: float) -> np.ndarray:
-    """Depth [H, W], nan where nothing is, as u8 [H, W, 3]: turbo, red is near; far: scene units,
-    the darkest.
-    """
+    """Depth [H, W], nan unknown, as u8 [H, W, 3]: turbo, red near; far: the darkest depth."""
     from matplotlib import colormaps
 
     colors = colormaps["turbo"](1 - (np.nan_to_num(depth, nan=far) / far).clip(0, 1))[..., :3]
@@ -220,13 +229,7 @@ def depth_colors(depth: np.ndarray, far: float) -> np.ndarray:
 
 def library() -> Any:
     """PyAV. Raises ConfigError with the command that installs it."""
-    try:
-        import av
-    except ImportError:
-        raise ConfigError(
-            f"videos need the extra `video`: {INSTALL}; or render into a folder"
-        ) from None
-    return av
+    return extra("av", "writing a video", "render into a folder")
 
 
 def render_video(
@@ -237,12 +240,10 @@ def render_video(
     rate: int,
     progress: Progress,
 ) -> None:
-    """Render one kind of frames into a video; frames lie beside it, and stay there until it is
-    written.
+    """Render one kind of frames into a video; its frames are kept beside it until it is written.
 
     Raises: ConfigError where `out` exists, on two kinds, and on sizes that no video has.
     """
-    library()
     if out.exists():
         raise ConfigError(f"{out} exists; remove it, or choose another --out")
     if len(shot.kinds) != 1:
@@ -255,10 +256,11 @@ def render_video(
     check_size(next(iter(sizes)))
     kind, folder = shot.kinds[0], out.with_name(f".frames-{out.name}")
     files = render_frames(scene, cameras, shot, folder, progress)[kind]
-    far = 1.0
+    images: Iterable[np.ndarray] = map(read_rgb, files)
     if kind == "depth":
         far = max(float(np.nanmax(np.load(path), initial=1e-6)) for path in files)
-    write_video(out, (shown(kind, path, far) for path in files), next(iter(sizes)), rate)
+        images = (depth_colors(np.load(path), far) for path in files)
+    write_video(out, images, next(iter(sizes)), rate)
     shutil.rmtree(folder)
 
 
@@ -271,9 +273,7 @@ def check_size(size: tuple[int, int]) -> None:
 
 
 def write_video(path: Path, frames: Iterable[np.ndarray], size: tuple[int, int], rate: int) -> None:
-    """Write pictures u8 [H, W, 3] of `size` (width, height), `rate` a second, whole or not at
-    all.
-    """
+    """Write pictures u8 [H, W, 3] of `size` (width, height), `rate` a second, atomically."""
     av = library()
     check_size(size)
     with atomic_path(path) as temporary, av.open(str(temporary), "w") as container:

@@ -1,6 +1,5 @@
 """A closed-set segmenter from the Hugging Face hub, or its cache, as the three files of a teacher;
-and
-a teacher tried on one image before a scene is: what it is, what it costs, what it sees.
+and a trial of a teacher on an image before a scene: its settings, cost and labels.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ import numpy as np
 
 from chebsplat.errors import ChebsplatError, ConfigError, InputError
 from chebsplat.formats.artifact import sha256_file
+from chebsplat.formats.extras import require
 from chebsplat.formats.files import parse_json
 from chebsplat.formats.images import images_below, read_rgb
 from chebsplat.formats.onnx_files import model_sha256, weight_files
@@ -31,28 +31,29 @@ from chebsplat.stages.settings import MAX_CHANNELS, TeacherSection
 from chebsplat.stages.teacher_models.label_space import closed_set, label_set, open_vocabulary
 from chebsplat.synthetic.layout import REFERENCE
 
-TEACHERS = {"segformer-b0-ade": "Xenova/segformer-b0-finetuned-ade-512-512"}  # ours: the hub's
+TEACHERS = {
+    "segformer-b0-ade": "Xenova/segformer-b0-finetuned-ade-512-512"
+}  # repository on the hub by our name
 REPOSITORY = re.compile(r"hf:([\w.-]+/[\w.-]+?)(?:@([\w./-]+))?")
 GRAPH, CLASSES, PREPARATION = "onnx/model.onnx", "config.json", "preprocessor_config.json"
-WIDER = 4 / 3  # of a photo than of the square that a segmenter is trained on
-STEPS = (  # of an image processor: what keys of a TOML stand for, and what leaves a photo alone
-    "resize", "center_crop", "rescale", "normalize", "flip_channel_order", "convert_rgb", "reduce_labels", "pad",
+WIDER = 4 / 3  # aspect ratio of a photo, for the square that a segmenter is trained on
+STEPS = (  # of an image processor: those that keys of a TOML replace, and those without effect
+    "resize", "center_crop", "rescale", "normalize", "flip_channel_order", "convert_rgb",
+    "reduce_labels", "pad",
 )  # fmt: skip
 AGAIN = "run the same command again"
-SHOWN = 8  # labels
-TRIED = 8  # photos
+N_LABELS, N_PHOTOS = 8, 8  # of a trial
 
 
 def get_teacher(
     name: str, out: Path | None = None, graph: str = GRAPH
 ) -> tuple[Path, list[tuple[str, str]]]:
-    """Fetch a teacher into a folder, as NAME.onnx, NAME.toml and NAME.txt; the .onnx, and what
-    `check-teacher` finds.
+    """Fetch a teacher into a folder as NAME.onnx, .toml and .txt; the .onnx, and `check` of it.
 
-    Args: name: of TEACHERS, or hf:OWNER/NAME[@REVISION]; out: the folder, otherwise one called
-          like the teacher, here; graph: the ONNX file in the repository.
+    Args: name: of TEACHERS, or hf:OWNER/NAME[@REVISION]; out: the folder, otherwise one called like
+      the teacher, here; graph: the ONNX file in the repository.
     Raises: ConfigError on a name or folder that cannot be; InputError naming what is missing,
-            damaged or not reached.
+      damaged or not reached.
     """
     repository, revision, short = parsed(name)
     folder = out or Path(short)
@@ -64,61 +65,58 @@ def get_teacher(
                 f"{folder} exists and is not {origin}; remove it, or choose another --out"
             )
         return model, check(model)
-    held = {file: fetched(repository, file, revision) for file in (CLASSES, PREPARATION, graph)}
+    files = {file: fetch_file(repository, file, revision) for file in (CLASSES, PREPARATION, graph)}
     weights = {
-        name: fetched(repository, f"{PurePosixPath(graph).parent / name}", revision)
-        for name in weight_files(held[graph])
+        name: fetch_file(repository, f"{PurePosixPath(graph).parent / name}", revision)
+        for name in weight_files(files[graph])
     }
     part = folder.with_name(f".part-{folder.name}")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     try:
-        made = part / model.name
-        shutil.copyfile(held[graph], made)
+        graph_copy = part / model.name
+        shutil.copyfile(files[graph], graph_copy)
         for name, file in weights.items():
             (part / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, part / name)
-        classes = class_names(held[CLASSES], repository)
-        made.with_suffix(".txt").write_text("\n".join(classes) + "\n", encoding="utf-8")
+        classes = class_names(files[CLASSES], repository)
+        graph_copy.with_suffix(".txt").write_text("\n".join(classes) + "\n", encoding="utf-8")
         values = {"name": short, "output": "logits", "labels": f"{short}.txt", "origin": origin}
-        values |= {"sha256": model_sha256(made)} | preparation(held[PREPARATION], repository)
+        values |= {"sha256": model_sha256(graph_copy)} | preparation(files[PREPARATION], repository)
         lines = (f"{k} = {json.dumps(value, ensure_ascii=False)}\n" for k, value in values.items())
-        made.with_suffix(".toml").write_text("".join(lines), encoding="utf-8")
+        graph_copy.with_suffix(".toml").write_text("".join(lines), encoding="utf-8")
         part.rename(folder)
         return model, check(model)
-    except ChebsplatError:  # what was fetched is no teacher
+    except ChebsplatError:  # it is no teacher
         shutil.rmtree(part, ignore_errors=True)
         shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
 def parsed(name: str) -> tuple[str, str, str]:
-    """(repository, revision, what its files are called)."""
+    """(repository, revision, stem of the teacher's files)."""
     if name in TEACHERS:
         return TEACHERS[name], "main", name
-    if not (found := REPOSITORY.fullmatch(name)):
-        known = ", ".join(TEACHERS)
+    if not (match := REPOSITORY.fullmatch(name)):
+        names = ", ".join(TEACHERS)
         raise ConfigError(
-            f"{name[:100]!a} is no teacher; there are {known}, and hf:OWNER/NAME[@REVISION]"
+            f"{name[:100]!a} is no teacher; there are {names}, and hf:OWNER/NAME[@REVISION]"
         )
-    return found[1], found[2] or "main", found[1].rpartition("/")[2].lower()
+    return match[1], match[2] or "main", match[1].rpartition("/")[2].lower()
 
 
-def fetched(repository: str, file: str, revision: str) -> Path:
-    """A file of a repository in the hub's cache, of the right checksum; downloaded if need be."""
-    try:
-        import httpx2
-        from huggingface_hub import constants, errors, hf_hub_download
-    except ImportError:
-        raise ConfigError(
-            "get-teacher needs the package huggingface_hub: .venv/bin/pip install -e '.[hub]' "
-            "installs it"
-        ) from None
+def fetch_file(repository: str, file: str, revision: str) -> Path:
+    """A file of a repository in the hub's cache, downloaded if need be, its checksum verified."""
+    require("huggingface_hub", "get-teacher")
+    import httpx2
+    from huggingface_hub import constants, errors, hf_hub_download
 
     where = f"{repository}: {file}"
     try:
         token = token_for(constants.ENDPOINT)
-        return verified(Path(hf_hub_download(repository, file, revision=revision, token=token)))
+        return verify_checksum(
+            Path(hf_hub_download(repository, file, revision=revision, token=token))
+        )
     except errors.LocalEntryNotFoundError as fault:
         why = f"{constants.ENDPOINT} is not reached"
         if isinstance(fault.__cause__, errors.OfflineModeIsEnabled):
@@ -130,17 +128,17 @@ def fetched(repository: str, file: str, revision: str) -> Path:
     except errors.HfHubHTTPError as fault:
         raise InputError(refusal(fault, repository, file, revision)) from None
     except (httpx2.TransportError, OSError, RuntimeError) as fault:
-        if isinstance(fault, OSError) and fault.errno is not None:  # of the disk
+        if isinstance(fault, OSError) and fault.errno is not None:  # an error of the disk
             raise
-        said = str(fault).partition("\n")[0]
-        raise InputError(f"{where} broke off ({said}); {AGAIN}") from None
+        message = str(fault).partition("\n")[0]
+        raise InputError(f"{where} broke off ({message}); {AGAIN}") from None
 
 
 def token_for(endpoint: str) -> Literal[False] | None:
-    """What the client sends as a token: its own (None), or nothing (False).
+    """The token argument for the hub's client: its own (None), or no token (False).
 
-    Choices: the token of a login is the hub's and goes to no other origin; one that HF_TOKEN names
-      goes where HF_ENDPOINT says. The client itself takes none along to where it is redirected.
+    Choices: the token of a login goes to huggingface.co alone; one that HF_TOKEN names goes to
+      HF_ENDPOINT. The client sends none along with a redirect.
     """
     where = urlsplit(endpoint)
     hub = (where.scheme, where.hostname, where.port or 443) == ("https", "huggingface.co", 443)
@@ -148,7 +146,7 @@ def token_for(endpoint: str) -> Literal[False] | None:
 
 
 def refusal(fault: Any, repository: str, file: str, revision: str) -> str:
-    """One line about what the hub answers instead of a file."""
+    """One line about the hub's error for a file."""
     kind = type(fault).__name__
     if kind == "RemoteEntryNotFoundError":
         return (
@@ -163,9 +161,8 @@ def refusal(fault: Any, repository: str, file: str, revision: str) -> str:
     return f"hf:{repository}: the hub answers {fault.response.status_code} for {file}; {AGAIN}"
 
 
-def verified(path: Path) -> Path:
-    """A file of the hub's cache, if it has the checksum by which the cache calls it: sha256 of what
-    Git LFS holds, git's own of small files.
+def verify_checksum(path: Path) -> Path:
+    """A file of the hub's cache, if it has the checksum in its name: sha256, or git's own.
 
     Raises: InputError naming the file and both checksums.
     """
@@ -177,13 +174,13 @@ def verified(path: Path) -> Path:
         )
     checksum, blob = path.readlink().name, path.resolve()
     if re.fullmatch(r"[0-9a-f]{64}", checksum):
-        found = sha256_file(blob)
+        digest = sha256_file(blob)
     else:
         data = blob.read_bytes()
-        found = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
-    if found != checksum:
-        told = f"{blob} has the checksum {found}, {checksum} is right"
-        raise InputError(f"{told}: damaged on the way; remove it, and {AGAIN}")
+        digest = hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+    if digest != checksum:
+        mismatch = f"{blob} has the checksum {digest}, {checksum} is right"
+        raise InputError(f"{mismatch}: damaged on the way; remove it, and {AGAIN}")
     return blob
 
 
@@ -195,9 +192,7 @@ def document(path: Path) -> dict[str, Any]:
 
 
 def class_names(path: Path, repository: str) -> list[str]:
-    """Names of the classes in the order of the channels, unique, as a file of labels can hold
-    them.
-    """
+    """Names of the classes in the order of the channels, unique, as a label file can hold them."""
     named = document(path).get("id2label")
     if (
         not isinstance(named, dict)
@@ -216,22 +211,23 @@ def class_names(path: Path, repository: str) -> list[str]:
 
 
 def preparation(path: Path, repository: str) -> dict[str, Any]:
-    """Keys of a teacher's TOML that feed a model as its image processor does.
+    """Keys of a teacher's TOML with the effect of the model's image processor.
 
-    Raises: InputError naming a step or a value that no key stands for.
+    Raises: InputError naming a step or a value that no key can replace.
     """
     try:
-        return feeding({key: value for key, value in document(path).items() if value is not None})
+        return preprocessing_keys(
+            {key: value for key, value in document(path).items() if value is not None}
+        )
     except ValueError as error:
         why = f"hf:{repository}: {PREPARATION} {error}"
         raise InputError(f"{why}; export the model yourself (docs/teachers.md)") from None
 
 
-def feeding(values: dict[str, Any]) -> dict[str, Any]:
-    """These keys, of an image processor's values. Raises: ValueError.
+def preprocessing_keys(values: dict[str, Any]) -> dict[str, Any]:
+    """Keys of a teacher's TOML from an image processor's values. Raises ValueError.
 
-    Choices: what is cropped from a photo's middle is a window's size; a photo keeps its aspect
-      ratio.
+    Choices: a centre crop becomes the window's size; a photo keeps its aspect ratio.
     """
 
     def does(step: str, usual: bool) -> bool:
@@ -256,7 +252,9 @@ def feeding(values: dict[str, Any]) -> dict[str, Any]:
         raise ValueError(
             "turns the order of channels that are normalised apart (do_flip_channel_order)"
         )
-    whole = 1 if np.isclose(255 * factor, 1, 1e-9) else 255 * factor  # what 255 becomes
+    whole = (
+        1 if np.isclose(255 * factor, 1, 1e-9) else 255 * factor
+    )  # the value of 255 after rescaling
     if max(*mean, *std) > 1 and whole <= 1:
         raise ValueError(
             "has image_mean or image_std of colours in 0 to 255, and rescales to 0 to 1 before"
@@ -264,22 +262,20 @@ def feeding(values: dict[str, Any]) -> dict[str, Any]:
     number = values.get("resample", 2)
     if number not in range(len(RESAMPLING)):
         raise ValueError(f"has a resample of {number!r:.40}")
-    found: dict[str, Any] = {"mean": [m / whole for m in mean], "std": [s / whole for s in std]}
-    found |= {"order": "BGR"} if flipped else {}
-    found |= {"resample": RESAMPLING[number]} if number != 2 else {}
-    return found | window_of(values, does("resize", True), does("center_crop", False))
+    keys: dict[str, Any] = {"mean": [m / whole for m in mean], "std": [s / whole for s in std]}
+    keys |= {"order": "BGR"} if flipped else {}
+    keys |= {"resample": RESAMPLING[number]} if number != 2 else {}
+    return keys | window_of(values, does("resize", True), does("center_crop", False))
 
 
 def three(value: Any) -> list[float]:
-    """Three numbers of a list or of one number; none of anything else."""
+    """Three numbers from a list or from one number; an empty list otherwise."""
     listed = value if isinstance(value, list) else [value] * 3
     return listed if len(listed) == 3 and all(type(v) in (int, float) for v in listed) else []
 
 
 def window_of(values: dict[str, Any], resized: bool, cropped: bool) -> dict[str, Any]:
-    """`size` and `base` of a TOML: the sides of a window, and a photo's long side. Raises:
-    ValueError.
-    """
+    """`size` and `base` of a TOML: a window's sides and a photo's long side. Raises ValueError."""
 
     def sides(key: str) -> tuple[list[int], int | None]:
         of = values.get(key)
@@ -287,12 +283,12 @@ def window_of(values: dict[str, Any], resized: bool, cropped: bool) -> dict[str,
         of = of if isinstance(of, dict) else {"shortest_edge": of}
         longest = of.get("longest_edge")
         short = of.get("shortest_edge", longest)
-        found = [
+        lengths = [
             side for side in (of.get("height", short), of.get("width", short)) if type(side) is int
         ]
-        if len(found) < 2 or not isinstance(longest, int | None):
+        if len(lengths) < 2 or not isinstance(longest, int | None):
             raise ValueError(f"has no {key} of whole numbers")
-        return found, longest
+        return lengths, longest
 
     crop = {"size": sides("crop_size")[0]} if cropped else {}
     if not resized:
@@ -305,59 +301,66 @@ def window_of(values: dict[str, Any], resized: bool, cropped: bool) -> dict[str,
 def check(
     model: Path, photos: Sequence[Path] = (), labels: str | None = None
 ) -> list[tuple[str, str]]:
-    """(what, finding) of a teacher. Raises what the teacher stage would.
+    """(topic, finding) of a teacher. Raises as the teacher stage does.
 
-    Args: photos: or folders of them, which tell the usual mistakes (`teacher_models/trials.py`);
-          none: a view of a generated room; labels: as teacher.labels, None: the teacher's own.
+    Args: photos: or folders of them, to test for usual mistakes (`teacher_models/trials.py`); none:
+      a view of a generated room; labels: as teacher.labels, None: the teacher's own.
     """
     from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-    from chebsplat.stages.teacher_models.trials import tried
+    from chebsplat.stages.teacher_models.trials import try_variants
 
     settings = TeacherSection()
     teacher = read_teacher(model)
     network = TeacherInference(teacher, n_threads())
-    found = [
+    groups = [
         images_below(path, "give another --photo") if path.is_dir() else [path] for path in photos
     ]
-    files = [file for of in found for file in of]
-    looked_at = (
-        [shown(file) for file in files[:: -(-len(files) // TRIED)]] if files else [shown(None)]
+    files = [file for of in groups for file in of]
+    trial_images = (
+        [read_photo(file) for file in files[:: -(-len(files) // N_PHOTOS)]]
+        if files
+        else [read_photo(None)]
     )
-    (name, image), images = looked_at[0], [image for _, image in looked_at]
+    (name, image), images = trial_images[0], [image for _, image in trial_images]
     grid, n_channels = network.grid(image, settings.downscale)
     if teacher.output == "logits":
-        asked = label_set(teacher, labels, None) if labels else None
-        space = closed_set(teacher, asked, n_channels, settings.n_channels)
+        label_names = label_set(teacher, labels, None) if labels else None
         network.judge(images)
+        of_classes = network.class_shares(images, grid)
+        space = closed_set(teacher, label_names, of_classes, settings.n_channels)
     else:
         space = open_vocabulary(teacher, label_set(teacher, labels, None), n_channels, None)
-    began = time.perf_counter()
+    start = time.perf_counter()
     _, pseudo_labels, confidence = space.split(
         network.features(image, grid, settings.scales, settings.flips, name)
     )
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - start
     size = network.scaled_size(image, 1.0)
     window = network.window(size)
     counts = np.bincount(pseudo_labels.ravel(), minlength=len(space.names))
-    seen = [f"{space.names[k]} {counts[k] / pseudo_labels.size:.0%}" for k in np.argsort(-counts, kind="stable")[:SHOWN] if counts[k]]  # fmt: skip  # noqa: E501
+    shares = [
+        f"{space.names[k]} {counts[k] / pseudo_labels.size:.0%}"
+        for k in np.argsort(-counts, kind="stable")[:N_LABELS]
+        if counts[k]
+    ]
     wide = teacher.output == "features" and n_channels > MAX_CHANNELS
     by = ", as its labels are names alone" if teacher.guessed else ""
     findings = []
     if teacher.output == "logits":
-        taken = "" if network.scores == LOGITS else ", told by its values, and taken as such"
+        remark = "" if network.scores == LOGITS else ", told by its values, and taken as such"
         if sureness(float(confidence.mean()), len(space.names)) < UNSURE:
-            taken += (
+            remark += (
                 "; unsure of everything, as of a softmax taken twice or of logits that were "
                 "scaled down"
             )
-        findings.append(("scores", network.scores + taken))
+        findings.append(("scores", network.scores + remark))
     if files:
         classes = (
             read_label_table(teacher.labels)[0]
             if teacher.output == "logits" and teacher.labels
             else space.names
         )
-        findings += tried(network, images, classes, space.embeddings)
+        findings += try_variants(network, images, classes, space.embeddings)
     return [
         ("name", f"{teacher.name} ({model}, {model.stat().st_size / 2**20:.1f} MB)"),
         (
@@ -374,19 +377,19 @@ def check(
         ("map", f"{grid[1]} x {grid[0]}: one feature every {image.shape[0] / grid[0]:.3g} pixels"),
         ("labels", f"{len(space.names)}, from {labels or teacher.labels}"),
         ("seconds", f"{seconds:.2f} a view, on {n_threads()} threads"),
-        ("sees", f"{', '.join(seen)} (mean confidence {confidence.mean():.2f})"),
+        ("sees", f"{', '.join(shares)} (mean confidence {confidence.mean():.2f})"),
         *findings,
     ]
 
 
 def n_windows(size: tuple[int, int], window: tuple[int, int]) -> int:
-    """How many windows (H, W) cover an image (H, W)."""
+    """The number of windows (H, W) that cover an image (H, W)."""
     rows, columns = (window_starts(n, side) for n, side in zip(size, window, strict=True))
     return len(rows) * len(columns)
 
 
-def shown(photo: Path | None) -> tuple[str, np.ndarray]:
-    """(name, image u8 [H, W, 3])."""
+def read_photo(photo: Path | None) -> tuple[str, np.ndarray]:
+    """(name, image u8 [H, W, 3]) of a photo, or of a view of a generated room."""
     from chebsplat.stages.channels import generated
 
     if photo is None:

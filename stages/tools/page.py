@@ -1,6 +1,4 @@
-"""One HTML page of a scene that opens without a server: Gaussians, what they mean, and the words to
-ask them for.
-"""
+"""One HTML page of a scene that opens without a server: Gaussians, labels, and words to query."""
 
 from __future__ import annotations
 
@@ -29,9 +27,9 @@ from chebsplat.labels.names import folded
 from chebsplat.stages.pages.parts import rendered
 from chebsplat.stages.tools.query import (
     are_words,
-    embedded,
+    embed_words,
     is_closed,
-    taught,
+    read_features,
     teacher_of,
     understood,
 )
@@ -40,18 +38,16 @@ from chebsplat.stages.tools.up import Up, up_of
 log = logging.getLogger("chebsplat")
 
 TEMPLATE = Path(__file__).parents[1] / "pages/scene/page.html"
-WARM = 16  # colours of the scale of heat
+WARM = 16  # colours of the heat scale
 
 
 @dataclass
 class Words:
-    """What a page can be asked: L words, embeddings f32 [L, C], and f32 [K, C] of the phrases they
-    are weighed against.
+    """The words of a page, embeddings f32 [L, C], and those of phrases to compare with [K, C].
 
-    against: None where words are the scene's labels, each weighed against all others.
+    against: None where words are the scene's labels, each compared with all others.
     rivals, calibration: f32 [R, C] and coefficients, where the teacher's relevancy is calibrated:
-      words but the
-    `uncalibrated` ones, rows of `words`, are answered in probabilities, as `query` does.
+      scores of all words but the rows `uncalibrated` are then probabilities, as of `query`.
     """
 
     words: list[str]
@@ -64,18 +60,24 @@ class Words:
 
 
 def write_page(
-    scene: Scene, name: str, teacher: Path | None, out: Path, sh_degree: int = 0, phrases: Sequence[str] = (),
-    more: Sequence[str] = (), up: Up | None = None,
-) -> dict[str, int]:  # fmt: skip
-    """Write the page, in the place of what is there.
+    scene: Scene,
+    name: str,
+    teacher: Path | None,
+    out: Path,
+    sh_degree: int = 0,
+    phrases: Sequence[str] = (),
+    more: Sequence[str] = (),
+    up: Up | None = None,
+) -> dict[str, int]:
+    """Write the page; an existing one is replaced.
 
     Args:
       scene:     from `Scene.read`, or `foreign`; name: the page's title.
       teacher:   the scene's `features` artifact, whose teacher's words are embedded; None: the
         labels alone.
-      sh_degree: 0 or 1; phrases: what words are weighed against, as of `query`; more: words beside
-        the teacher's own.
-      up:        against gravity; None: as the cameras were held.
+      sh_degree: 0 or 1; phrases: compared with words, as in `query`; more: words beside the
+        teacher's own.
+      up:        against gravity; None: the cameras' own.
     Returns: counts: Gaussians, views, labels, words, bytes.
     Raises:  InputError where the teacher is not the scene's or does not know a word.
     """
@@ -89,10 +91,17 @@ def write_page(
     packed = pack(scene.parameters, sh_degree)
     arrays: dict[str, np.ndarray] = packed.arrays | {"views": camera_rows(scene, center)}
     about: dict[str, Any] = {
-        "name": name, "ranges": packed.ranges, "center": center.tolist(), "up": up.tolist(), "extent": extent,
-        "origin": list(world.origin), "scale": world.scale,
-        "width": scene.cameras.width, "height": scene.cameras.height, "views": scene.cameras.names,
-    }  # fmt: skip
+        "name": name,
+        "ranges": packed.ranges,
+        "center": center.tolist(),
+        "up": up.tolist(),
+        "extent": extent,
+        "origin": list(world.origin),
+        "scale": world.scale,
+        "width": scene.cameras.width,
+        "height": scene.cameras.height,
+        "views": scene.cameras.names,
+    }
     counts = {"Gaussians": len(means), "views": len(scene.cameras.names)}
     words = None
     if (
@@ -131,7 +140,7 @@ def write_page(
         n=len(means),
         labels=about.get("labels"),
         words=f"{len(words.words):,}" if words else None,
-        weighed=weighed(words),
+        weighed=scoring_note(words),
         example=next((n for n in (scene.label_names or []) if n in ("chair", "sofa")), "a word"),
         note=f"SH degree {sh_degree}, quantised; made by chebsplat. Nothing is fetched or sent.",
         about=about,
@@ -143,20 +152,20 @@ def write_page(
 
 
 def foreign(ply: Path, up: Up | None = None, world: World | None = None) -> Scene:
-    """A scene of a splat from elsewhere: no semantics, and one camera that sees its middle half,
-    upright. world: to bring it into, from that of its source; None: one that suits it.
+    """A scene of a splat from elsewhere: no semantics, one upright camera on its middle half.
+    world: to transform it into, from that of its source; None: a suitable one.
 
     Raises: InputError naming the file. Choices: without `up` it is -y, as in COLMAP's and 3DGS' own
       frames.
     """
-    chosen = world or HERE
-    parameters, degree, _ = read_splats(ply, chosen)
-    if world is None and (chosen := World.of(parameters["means"].astype(np.float64))) != HERE:
-        parameters, degree, _ = read_splats(ply, chosen)
+    target = world or HERE
+    parameters, degree, _ = read_splats(ply, target)
+    if world is None and (target := World.of(parameters["means"].astype(np.float64))) != HERE:
+        parameters, degree, _ = read_splats(ply, target)
     if not len(parameters["means"]):
         raise InputError(f"{ply} holds no Gaussians; choose another")
     degrees = parameters.setdefault("degrees", np.full(len(parameters["means"]), degree, np.uint8))
-    order = np.argsort(degrees, kind="stable")  # as renderers take them
+    order = np.argsort(degrees, kind="stable")  # the order of renderers
     parameters = {name: values[order] for name, values in parameters.items()}
     means = parameters["means"]
     low, high = np.quantile(means.astype(np.float64), (0.25, 0.75), axis=0)
@@ -171,14 +180,12 @@ def foreign(ply: Path, up: Up | None = None, world: World | None = None) -> Scen
     pose[:3, 3] = [0, 0, 2 * max(float((high - low).max()), 1e-3)] - pose[:3, :3] @ (low + high) / 2
     K = np.array([[554.0, 0, 320], [0, 554, 240], [0, 0, 1]])  # 60 degrees across
     return Scene(
-        parameters, Cameras(["start"], K[None], pose[None], 640, 480), order, summary=chosen.notes
+        parameters, Cameras(["start"], K[None], pose[None], 640, 480), order, summary=target.notes
     )
 
 
 def camera_rows(scene: Scene, center: np.ndarray) -> np.ndarray:
-    """f32 [V, 16]: cam_from_world's three rows of a frame whose origin is `center`, then fx, fy,
-    cx, cy.
-    """
+    """f32 [V, 16]: three rows of cam_from_world, with origin at `center`, then fx, fy, cx, cy."""
     poses = scene.cameras.cam_from_world[:, :3].copy()
     poses[:, :, 3] += poses[:, :, :3] @ center
     Ks = scene.cameras.Ks
@@ -187,9 +194,7 @@ def camera_rows(scene: Scene, center: np.ndarray) -> np.ndarray:
 
 
 def up_and_extent(scene: Scene) -> tuple[np.ndarray, float]:
-    """Up, unit [3]: the mean of the views' own; and the longest side of the box of 90 % of the
-    centres by each axis.
-    """
+    """Mean up of the views, unit [3]; longest side of the box with 90 % of centres by axis."""
     up = -scene.cameras.cam_from_world[:, 1, :3].mean(0)
     length = np.linalg.norm(up)
     up = up / length if length > 0.1 else -scene.cameras.cam_from_world[0, 1, :3]
@@ -198,15 +203,14 @@ def up_and_extent(scene: Scene) -> tuple[np.ndarray, float]:
 
 
 def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: list[str]) -> Words:
-    """The words of a page: the scene's labels, the teacher's table (or nouns, by its text encoder),
-    and `more`.
+    """The words of a page: the scene's labels, `more`, and the teacher's table or nouns.
 
     Raises: as `query.understood`; ConfigError on phrases or more where a scene knows its labels
       alone.
     """
     names, rows = scene.label_names, scene.label_embeddings
-    assert names is not None and rows is not None  # the caller's
-    features, model = (None, None) if teacher is None else taught(teacher)
+    assert names is not None and rows is not None  # checked by the caller
+    features, model = (None, None) if teacher is None else read_features(teacher)
     if teacher is None or features is None or is_closed(features):
         if phrases or more:
             raise ConfigError(
@@ -217,34 +221,36 @@ def vocabulary(scene: Scene, teacher: Path | None, phrases: list[str], more: lis
             "" if teacher else ": it has no teacher's artifact",
         )
         return Words(names, rows, None, rows)
-    known = {folded(name) for name in names}
+    label_words = {folded(name) for name in names}
     others = [
-        word for word in dict.fromkeys([*more, *table_words(model)]) if folded(word) not in known
+        word
+        for word in dict.fromkeys([*more, *table_words(model)])
+        if folded(word) not in label_words
     ]
-    weighed = understood(teacher, others[0], phrases, calibrated=False)
-    found = embedded(others, features, model)
+    reference = understood(teacher, others[0], phrases, calibrated=False)
+    vectors = embed_words(others, features, model)
     order = sorted(range(len(names) + len(others)), key=[*names, *others].__getitem__)
     every = [*names, *others]
     words = Words(
         [every[k] for k in order],
-        np.concatenate([rows, found])[order],
-        weighed.phrases,
-        weighed.against,
+        np.concatenate([rows, vectors])[order],
+        reference.phrases,
+        reference.against,
     )
-    held = teacher_of(features, model)
-    if not phrases and (calibration := calibration_of(held.path)) is not None:
+    onnx_teacher = teacher_of(features, model)
+    if not phrases and (calibration := calibration_of(onnx_teacher.path)) is not None:
         words.rivals, words.calibration = (
-            embedded(calibration.rivals, features, model),
+            embed_words(calibration.rivals, features, model),
             Calibration(**calibration.calibration),
         )
         words.uncalibrated = [
-            k for k, known in enumerate(are_words(words.words, held)) if not known
+            k for k, covered in enumerate(are_words(words.words, onnx_teacher)) if not covered
         ]
     return words
 
 
-def weighed(words: Words | None) -> str:
-    """What a page says of how its words are answered."""
+def scoring_note(words: Words | None) -> str:
+    """A page's sentence on how its words are scored."""
     if words is None or words.against is None:
         return "the labels alone"
     if words.calibration is None:
@@ -254,9 +260,7 @@ def weighed(words: Words | None) -> str:
 
 
 def table_words(model: str | None) -> list[str]:
-    """The words that a teacher knows as they are; indoor nouns where it has a text encoder and no
-    table.
-    """
+    """The words of a teacher's table; indoor nouns where it has a text encoder and no table."""
     teacher = read_teacher(Path(model) if model else EMBEDDED)
     if teacher.labels is not None:
         names, embeddings = read_label_table(teacher.labels)

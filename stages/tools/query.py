@@ -1,4 +1,4 @@
-"""query: where in a finished scene is what some words mean? Relevancy by Gaussian and by label."""
+"""query: the Gaussians of a finished scene that match some words, and their relevancy by label."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from chebsplat.formats.onnx_files import model_sha256
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
 from chebsplat.labels.calibration import CUT, Calibration, presence, probability, relevancy
 from chebsplat.labels.names import folded
-from chebsplat.stages.teacher_models.text_encoder import found, text_embeddings
+from chebsplat.stages.teacher_models.text_encoder import match_names, text_embeddings
 
 log = logging.getLogger("chebsplat")
 
@@ -26,13 +26,11 @@ CANONICAL = ("object", "things", "stuff", "texture")  # LERF's: phrases that fit
 
 @dataclass
 class Query:
-    """A query in a scene's own channels: what is asked for [C], and what it is weighed against [K,
-    C].
+    """A query in a scene's channels: its embedding [C], and those that it is compared with [K, C].
 
     rivals, calibration: f32 [R, C] and coefficients of the teacher, where its relevancy is
-      calibrated and the text is a
-    word of it; None: scores are LERF's relevancy. closed: the scene knows its labels alone, and
-    this is one of them.
+      calibrated and the text is a word of it; None: scores are LERF's relevancy. closed: the scene
+      knows its labels alone, and this is one of them.
     """
 
     text: str
@@ -44,15 +42,13 @@ class Query:
     closed: bool = False
 
     def scores(self, features: np.ndarray) -> np.ndarray:
-        """f32 [...] in [0, 1] of features [..., C]: how likely each is what the words mean, or its
-        relevancy.
-        """
+        """f32 [...] in [0, 1] of features [..., C]: probability, or LERF's relevancy."""
         if self.calibration is None or self.rivals is None:
             return relevancy(features, self.embedding, self.against)
         return probability(features, self.embedding, self.rivals, self.calibration)
 
     def answer(self, features: np.ndarray) -> Relevancy:
-        """What a whole scene's features [N, C] say."""
+        """The answer of a whole scene by its features [N, C]."""
         scores = self.scores(features)
         if self.calibration is not None:
             return Relevancy(self.text, scores, True, presence(scores, self.calibration))
@@ -63,15 +59,13 @@ class Query:
 
 @dataclass(frozen=True, eq=False)
 class Relevancy:
-    """How a scene answers to a query.
+    """A scene's answer to a query.
 
-    scores:     f32 [N] in [0, 1] of every Gaussian: how likely it is what the words mean, where
-      that is calibrated;
-                otherwise LERF's relevancy, above 0.5 where the words fit better than all that they
-                are weighed against.
-    calibrated: whether scores are probabilities.
-    presence:   how likely the scene has it at all, in [0, 1]; None where nobody has calibrated
-      that.
+    scores:     f32 [N] in [0, 1] of every Gaussian: the probability that it is what the words mean,
+      where calibrated; otherwise LERF's relevancy, above 0.5 where the words fit better than all
+      phrases that they are compared with.
+    calibrated: true where scores are probabilities.
+    presence:   the probability that the scene has it at all; None where uncalibrated.
     """
 
     text: str
@@ -81,18 +75,18 @@ class Relevancy:
 
     @property
     def cut(self) -> float:
-        """The suggested one: what scores above it is selected."""
+        """The suggested threshold; scores above it are selected."""
         return CUT
 
     @property
     def selected(self) -> np.ndarray:
-        """Bool [N]: which Gaussians score above the cut."""
-        chosen: np.ndarray = self.scores > self.cut
-        return chosen
+        """Mask [N] of the Gaussians above the cut."""
+        mask: np.ndarray = self.scores > self.cut
+        return mask
 
     @property
     def present(self) -> bool | None:
-        """Whether the scene likely has it; None where nobody has calibrated that."""
+        """True where the scene likely has it; None where uncalibrated."""
         return None if self.presence is None else self.presence > 0.5
 
     def __str__(self) -> str:
@@ -112,15 +106,13 @@ class Relevancy:
         )
 
 
-def taught(path: Path) -> tuple[Features, str | None]:
-    """A scene's `features` artifact, and the model that it was made with; None: the embedded
-    one.
-    """
+def read_features(path: Path) -> tuple[Features, str | None]:
+    """A scene's `features` artifact, and the model that made it; None: the embedded one."""
     return Features.read(path), read_manifest(path).config["teacher"]["model"]
 
 
 def is_closed(features: Features) -> bool:
-    """Whether the teacher knows its labels and no other words."""
+    """True where the teacher scores its own labels only."""
     return (
         features.convention["kind"] in ("labels", "given")
         or features.convention.get("output") == "logits"
@@ -128,33 +120,33 @@ def is_closed(features: Features) -> bool:
 
 
 def understood(path: Path, text: str, phrases: list[str], calibrated: bool = True) -> Query:
-    """The words as vectors of the scene's channels, by the teacher that the scene was trained from.
+    """A query by the text space of the teacher that the scene was trained from.
 
-    Args: calibrated: whether the calibration of the teacher is taken where there is one.
-    Choices: what `phrases` say is weighed against these, by LERF's relevancy; so is a phrase that
-      is no word of the teacher's table, for which no calibration speaks, against LERF's phrases.
+    Args: calibrated: use the teacher's calibration where there is one.
+    Choices: with `phrases` the text is compared with these, by LERF's relevancy; a text that is not
+      in the teacher's table, which the calibration does not cover, with LERF's own phrases.
     """
-    features, model = taught(path)
+    features, model = read_features(path)
     if is_closed(features):
         return among_labels(features, text, phrases)
     teacher = teacher_of(features, model)
-    found = (
+    calibration = (
         calibration_of(teacher.path)
         if calibrated and not phrases and all(are_words([text], teacher))
         else None
     )
-    if found is not None:
-        vectors = embedded([text, *found.rivals], features, model)
+    if calibration is not None:
+        vectors = embed_words([text, *calibration.rivals], features, model)
         return Query(
             text,
             vectors[0],
-            found.rivals,
+            calibration.rivals,
             vectors[1:],
             vectors[1:],
-            Calibration(**found.calibration),
+            Calibration(**calibration.calibration),
         )
     try:
-        vectors = embedded([text, *(phrases or CANONICAL)], features, model)
+        vectors = embed_words([text, *(phrases or CANONICAL)], features, model)
     except InputError as error:
         if phrases or repr(CANONICAL[0]) not in str(error):
             raise
@@ -175,30 +167,26 @@ def teacher_of(features: Features, model: str | None) -> TeacherModel:
 
 
 def are_words(texts: list[str], teacher: TeacherModel) -> list[bool]:
-    """Whether each is one of the words that a calibration speaks for: those of the teacher's table,
-    if it has one.
-    """
+    """True for each text that a calibration covers: words of the teacher's table, if any."""
     if teacher.labels is None:
         return [True] * len(texts)
-    return [row >= 0 for row in found(texts, read_label_table(teacher.labels)[0], False)]
+    return [row >= 0 for row in match_names(texts, read_label_table(teacher.labels)[0], False)]
 
 
-def embedded(words: list[str], features: Features, model: str | None) -> np.ndarray:
-    """Words [L] -> f32 [L, C] by the text space of the ONNX teacher. Raises InputError if it is no
-    longer the same.
-    """
+def embed_words(words: list[str], features: Features, model: str | None) -> np.ndarray:
+    """Words [L] -> f32 [L, C] by the ONNX teacher. Raises InputError if that has changed."""
     vectors = text_embeddings(words, teacher_of(features, model))
     if features.channels is not None:
         vectors = features.channels.embed(vectors)
-        kept = float(np.linalg.norm(vectors[0]))
-        log.info("%.0f %% of the query's length lies in the scene's channels", 100 * kept)
+        share = float(np.linalg.norm(vectors[0]))
+        log.debug("the scene's channels keep %.0f %% of the query's embedding", 100 * share)
     return vectors
 
 
 def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
-    """A query of a scene whose teacher knows its labels and no other words."""
+    """A query of a scene whose teacher scores its own labels only."""
     names = features.label_names
-    rows = found([text, *phrases], names, last_word=False)
+    rows = match_names([text, *phrases], names, last_word=False)
     target, others = rows[0], rows[1:]
     for word, row in zip((text, *phrases), rows, strict=True):
         if row < 0:
@@ -215,12 +203,17 @@ def among_labels(features: Features, text: str, phrases: list[str]) -> Query:
         raise ConfigError(
             f"{text!r} is the scene's only label: there is nothing to weigh it against"
         )
-    return Query(text, features.label_embeddings[target], [names[k] for k in others], features.label_embeddings[others],
-                 closed=not phrases)  # fmt: skip
+    return Query(
+        text,
+        features.label_embeddings[target],
+        [names[k] for k in others],
+        features.label_embeddings[others],
+        closed=not phrases,
+    )
 
 
 def table(answer: Relevancy, labels: np.ndarray, names: list[str], n_rows: int) -> list[str]:
-    """Lines: the labels of the highest mean score."""
+    """Lines of a table: the labels of the highest mean score."""
     rows = [(float(answer.scores[labels == k].mean()), k) for k in np.unique(labels) if k >= 0]
     width = max([len(name) for name in names] + [5])
     mean = "mean probability" if answer.calibrated else "mean relevancy"

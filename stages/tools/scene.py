@@ -1,9 +1,8 @@
-"""A finished scene, opened: render it, ask it, take a part of it. Nothing is written but by
-`export`.
-"""
+"""A finished scene, opened: render, query and select; only `export` writes a file."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -28,7 +27,7 @@ from chebsplat.stages.tools.query import Query, Relevancy, understood
 from chebsplat.stages.tools.up import up_of
 from chebsplat.views import View
 
-COVERED = 0.5  # of a pixel, below which it has no label
+COVERED = 0.5  # least coverage of a pixel with a label
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,17 +54,17 @@ class Camera:
         return position
 
     def view(self) -> View:
-        """For `render.SceneRenderer`."""
+        """The camera for `render.SceneRenderer`."""
         K, pose = (torch.from_numpy(matrix).float() for matrix in (self.K, self.cam_from_world))
         return View(K, pose, self.width, self.height)
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a camera sees. color u8 [H, W, 3]; depth f32 [H, W] along its axis, scene units, nan
-    where nothing is; alpha f32 [H, W], how far each pixel is covered; where there are semantics
-    features f32 [H, W, C] and labels i32 [H, W], rows of `label_names`, -1 where a pixel is less
-    than half covered.
+    """The render of a camera. color u8 [H, W, 3]; depth f32 [H, W] along its axis, scene units, nan
+    where nothing is; alpha f32 [H, W], coverage of each pixel; where there are semantics features
+    f32 [H, W, C] and labels i32 [H, W], rows of `label_names`, -1 where a pixel is less than half
+    covered.
     """
 
     color: np.ndarray
@@ -76,13 +75,12 @@ class Picture:
 
 
 class OpenedScene:
-    """N Gaussians with their colours and, where there is a teacher, what they mean.
+    """N Gaussians with their colours and, where there was a teacher, semantic features and labels.
 
     parameters: raw, as `formats.scene.Scene` holds them; `features` f32 [N, C], `labels` i32 [N]
-      (-1: none) and
-    `label_names` and `label_embeddings` f32 [L, C] are None without semantics; `cameras`: of the
-    capture, in its order. Parameters are in the scene's own world; cameras, points, boxes, depth
-    and files in that of its source (`world`).
+      (-1: none) and `label_names` and `label_embeddings` f32 [L, C] are None without semantics;
+      `cameras`: of the capture, in its order. Parameters are in the scene's own world; cameras,
+      points, boxes, depth and files in that of its source (`world`).
     """
 
     def __init__(self, scene: Scene, source: Path, teacher: Path | None = None):
@@ -92,10 +90,13 @@ class OpenedScene:
             scene.labels,
             scene.label_names,
         )
-        self.label_embeddings, held = scene.label_embeddings, scene.cameras
+        self.label_embeddings, views = scene.label_embeddings, scene.cameras
         self.world = World.read(scene.summary)
-        views = zip(held.names, held.Ks, self.world.poses_outward(held.cam_from_world), strict=True)
-        self.cameras = [Camera(name, K, pose, held.width, held.height) for name, K, pose in views]
+        poses = self.world.poses_outward(views.cam_from_world)
+        self.cameras = [
+            Camera(name, K, pose, views.width, views.height)
+            for name, K, pose in zip(views.names, views.Ks, poses, strict=True)
+        ]
 
     def __len__(self) -> int:
         return len(self.parameters["means"])
@@ -115,13 +116,13 @@ class OpenedScene:
 
     def camera(self, name: str) -> Camera:
         """The capture's view of this name. Raises ConfigError, with the nearest names."""
-        found = [camera for camera in self.cameras if camera.name == name]
-        if not found:
+        matches = [camera for camera in self.cameras if camera.name == name]
+        if not matches:
             near = ", ".join(suggest(name, [camera.name for camera in self.cameras]))
             raise ConfigError(
                 f"{self.source} has no view {name}" + (f"; near: {near}" if near else "")
             )
-        return found[0]
+        return matches[0]
 
     def inside(self, camera: Camera) -> Camera:
         """A camera of the source's world in that of the parameters, for the `renderer`."""
@@ -143,29 +144,29 @@ class OpenedScene:
         return Picture(color, depth, alpha, features, np.where(alpha < COVERED, -1, labels))
 
     def query(self, text: str, against: Sequence[str] = ()) -> np.ndarray:
-        """How likely each Gaussian is what the words mean, f32 [N] in [0, 1]: the scores of
-        `ask`.
-        """
+        """Probability or relevancy f32 [N] of each Gaussian for the words: `ask`'s scores."""
         return self.ask(text, against).scores
 
     def ask(self, text: str, against: Sequence[str] = ()) -> Relevancy:
-        """What the scene answers to words: scores, a cut, what is selected, and whether the scene
-        has it at all.
+        """The scene's answer to words: scores, a cut, the selection, and presence in the scene.
 
-        Args: against: what the words are weighed against, by LERF's relevancy; default: the
-          calibration of the scene's
-              teacher; where it has none, or the words are a phrase, LERF's phrases; or all other
-              labels.
+        Args: against: phrases to compare the words with, by LERF's relevancy; default: the
+          calibration of the scene's teacher; where it has none, or the words are a phrase, LERF's
+          phrases; or all other labels.
         Raises: ConfigError without semantics, or on words that the scene's teacher cannot know.
         """
-        asked = self.understood(text, against)
+        query = self.understood(text, against)
         assert self.features is not None
-        return asked.answer(self.features)
+        return query.answer(self.features)
 
     def understood(self, text: str, against: Sequence[str] = ()) -> Query:
         """Words in the scene's own channels. Args and errors as of `query`."""
         if self.features is None:
-            raise ConfigError(f"{self.source} has no semantics; train the scene with a teacher")
+            raise ConfigError(
+                f"{self.source} has colours alone: no 2D teacher has said what things are; make "
+                f"scene={shlex.quote(str(self.source))} set=teacher.model=MODEL.onnx (chebsplat "
+                "get-teacher segformer-b0-ade fetches one), of a splat: chebsplat lift --capture"
+            )
         if self._teacher is None:
             raise ConfigError(
                 f"{self.source} has no teacher's artifact beside it; open the scene's folder"
@@ -186,11 +187,11 @@ class OpenedScene:
 
         Args: mask: bool [N]; label: names to keep; min_opacity: in [0, 1]; box: x0, y0, z0, x1, y1,
           z1 of centres.
-        Raises: ConfigError on a label that is not there or a filter that is none; DataFailure if
-          nothing is left.
+        Raises: ConfigError on an unknown label or an invalid filter; DataFailure if nothing is
+          left.
         """
         names = () if label is None else (label,) if isinstance(label, str) else tuple(label)
-        filters = passing(self.exported, self.source, names, min_opacity, box)
+        filters = filter_masks(self.exported, self.source, names, min_opacity, box)
         if mask is not None:
             filters["mask"] = mask = np.asarray(mask)
             if mask.shape != (len(self),) or mask.dtype != bool:
@@ -200,11 +201,9 @@ class OpenedScene:
         return self.part(filters)
 
     def part(self, filters: Mapping[str, np.ndarray]) -> OpenedScene:
-        """The Gaussians that pass all of some filters, bool [N] by name. Raises DataFailure where
-        none does.
-        """
-        kept = np.logical_and.reduce([np.ones(len(self), bool), *filters.values()])
-        if not kept.any():
+        """The Gaussians that pass all filters, bool [N] by name. Raises DataFailure if none."""
+        mask = np.logical_and.reduce([np.ones(len(self), bool), *filters.values()])
+        if not mask.any():
             means = self.parameters["means"]
             low, high = (
                 ",".join(f"{value:.4g}" for value in side) for side in (means.min(0), means.max(0))
@@ -216,28 +215,25 @@ class OpenedScene:
             raise DataFailure(
                 f"no Gaussian of {len(self)} is left ({why}); {where}: choose wider filters"
             )
-        parameters = {name: values[kept] for name, values in self.parameters.items()}
+        parameters = {name: values[mask] for name, values in self.parameters.items()}
         part = replace(
             self.exported,
             parameters=parameters,
-            order=np.argsort(np.argsort(self.exported.order[kept], kind="stable"), kind="stable"),
-            labels=None if self.labels is None else self.labels[kept],
+            order=np.argsort(np.argsort(self.exported.order[mask], kind="stable"), kind="stable"),
+            labels=None if self.labels is None else self.labels[mask],
         )
         return OpenedScene(part, self.source, self._teacher)
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres [N, 3], f32, or f64 where the source's world is another, and colours u8 [N, 3] of
-        SH degree 0.
-        """
+        """Centres [N, 3], f32 (f64 in another world), and colours u8 [N, 3] of SH degree 0."""
         means = self.world.outward(self.parameters["means"])
         return means, np.round(surface_of(self.parameters)[1] * 255).astype(np.uint8)
 
     def export(self, path: str | Path, up: np.ndarray | None = None) -> Path:
         """Write a splat as .ply, .spz, .sog or .glb, by the name's ending; PLY and GLB have labels.
 
-        Args:    up: against gravity, unit [3]: the splat is turned, so that it is -y, as viewers
-          have it, or y of a .glb; None: it lies where the capture does, a .glb turned as the
-          cameras were held.
+        Args:    up: against gravity, unit [3]: the splat is turned so that up is -y, as in viewers,
+          or y of a .glb; None: it stays in the capture's frame, a .glb upright by the cameras.
         Raises:  ConfigError if it exists or ends otherwise; DataFailure where SPZ cannot hold it.
         """
         path = Path(path)
@@ -255,16 +251,14 @@ class OpenedScene:
         return path
 
 
-def passing(
+def filter_masks(
     scene: Scene,
     path: Path,
     labels: tuple[str, ...],
     min_opacity: float,
     box: Sequence[float] | None,
 ) -> dict[str, np.ndarray]:
-    """Which Gaussians pass each filter that is asked for, bool [N] by its name. Args and errors:
-    see `extract`.
-    """
+    """Masks [N] of the Gaussians that pass each filter, by name. Args, errors: see `extract`."""
     filters: dict[str, np.ndarray] = {}
     if not 0 <= min_opacity <= 1:
         raise ConfigError(f"an opacity of at least {min_opacity:g}: a number from 0 to 1 is needed")
@@ -285,9 +279,7 @@ def passing(
 
 
 def has_label(scene: Scene, path: Path, names: tuple[str, ...]) -> np.ndarray:
-    """Which Gaussians bear one of the names. Raises ConfigError, with the nearest name, for one
-    that is unknown.
-    """
+    """Mask [N] of the Gaussians with one of the names. Raises ConfigError with the nearest name."""
     if scene.labels is None or scene.label_names is None:
         why = scene.summary.get("left_out", {}).get("labels", "it has no semantics")
         raise ConfigError(f"{path} has no labels: {why}")

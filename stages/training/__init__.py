@@ -1,1 +1,1 @@
-"""From artifacts and settings to a training."""
+"""Training: from artifacts and settings to a trainer, its steps, saves and facts."""

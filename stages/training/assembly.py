@@ -1,6 +1,4 @@
-"""From artifacts and settings to a trainer before its first step: one way for the stage and for
-every benchmark.
-"""
+"""Assembly of a trainer from artifacts and settings, for the stage and for every benchmark."""
 
 from __future__ import annotations
 
@@ -51,24 +49,21 @@ class Inputs:
 
 
 def read_inputs(job: Job) -> Inputs:
-    """The artifacts that this training reads, and as many of the points as `train.max_gaussians`
-    lets in.
+    """The artifacts that this training reads, with at most `train.max_gaussians` of the points.
 
     Raises: InputError if artifacts do not belong together or are damaged.
     """
     train = job.config.train
-    capture, points = (
-        Capture.read(job.inputs["capture"]),
-        within_cap(job, Points.read(job.inputs["points"])),
-    )
-    taught = "features" in job.inputs and train.semantics and train.features == "trained"
-    features = Features.read(job.inputs["features"]) if taught else None
+    capture = Capture.read(job.inputs["capture"])
+    points = within_cap(job, Points.read(job.inputs["points"]))
+    learns = "features" in job.inputs and train.semantics and train.features == "trained"
+    features = Features.read(job.inputs["features"]) if learns else None
     return Inputs(capture, points, features)
 
 
 def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
-    """A trainer before its first step, its open settings resolved; they, and what is off and why,
-    become facts.
+    """A trainer before its first step, its open settings resolved; adds facts on these, and on
+    parts left out.
 
     Args: backend: of `rasterize`.
     Raises: ConfigError, InputError or DataFailure, as its parts do.
@@ -80,7 +75,7 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
     train = resolved(job.config.train, replace(evidence, exposure_spread=stops))
     job.facts["decided"] = decided(job.config.train, train, features is not None)
     _note_left_out(job, train, features is not None, evidence.no_depth)
-    # sums of torch depend on it; the same bytes are promised for the same number
+    # sums of torch depend on it; the same number gives the same bytes
     torch.set_num_threads(n_threads())
     model = model_of(points, features, train, job.config.describe, job.device, backend, capture)
     undone = exposures if train.exposure == "measured" else None
@@ -103,13 +98,13 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
 
 
 def knowledge_of(earlier: Path, model: PrintedScene) -> dict[str, Tensor]:
-    """Bases that the training of the scene before left (Eq 15).
+    """Bases of the training of the scene before (Eq 15).
 
     Raises: InputError if they are of an encoder of another shape.
     """
     modules = Gaussians.read(earlier).modules
-    held = {n: torch.from_numpy(v) for n, v in modules.items() if n.startswith(KNOWLEDGE)}
-    bases = {name.removeprefix(KNOWLEDGE): basis for name, basis in held.items()}
+    own = {n: torch.from_numpy(v) for n, v in modules.items() if n.startswith(KNOWLEDGE)}
+    bases = {name.removeprefix(KNOWLEDGE): basis for name, basis in own.items()}
     maps = model.printed.encoder.key_projections()
     if any(name not in maps or len(basis) != len(maps[name]) for name, basis in bases.items()):
         raise InputError(f"{earlier} has knowledge of another encoder; start another sequence")
@@ -120,51 +115,42 @@ def _exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
     """Differences of training photos' exposures from their neighbours' [V, 3], stops; None: not
     measured. The spread becomes a fact.
     """
-    wanted = job.config.train.exposure
-    if wanted == "off" or (wanted == "auto" and capture.source.get("kind") == "generated"):
+    mode = job.config.train.exposure
+    if mode == "off" or (mode == "auto" and capture.source.get("kind") == "generated"):
         return None
     exposures, job.facts["exposure_stops"] = own_exposures(capture, points)
     return exposures
 
 
-def _why_no_exposure(given: TrainSection, stops: float | None) -> str:
-    """Reason for leaving photos' exposures as they are. stops: their spread, where it was
-    measured.
-    """
+def _why_no_exposure(train: TrainSection, stops: float | None) -> str:
+    """Reason for leaving photos' exposures as they are. stops: their spread; None: not measured."""
     if stops is not None:
         return f"photos differ by {stops:.2f} stops from those about them"
-    return "train.exposure is off" if given.exposure == "off" else "views are generated, all alike"
+    return "train.exposure is off" if train.exposure == "off" else "views are generated, all alike"
 
 
 def _note_left_out(job: Job, train: TrainSection, has_semantics: bool, no_depth: str) -> None:
-    """Say what this training does without, and why. train: resolved."""
-    given = job.config.train
+    """Note the parts that this training leaves out, and why. train: resolved."""
+    requested = job.config.train
     stops = job.facts.get("exposure_stops", {}).get("own")
-    if given.method == "printed":
+    if requested.method == "printed":
         for what in ("depth loss", "exposure by photo"):
             job.left_out(what, PRINTED_METHOD)
     else:
         if not train.weight_depth:
             job.left_out(
                 "depth loss",
-                "train.weight_depth is 0" if given.weight_depth is not None else no_depth,
+                "train.weight_depth is 0" if requested.weight_depth is not None else no_depth,
             )
         if train.exposure == "off":
-            job.left_out("exposure by photo", _why_no_exposure(given, stops))
+            job.left_out("exposure by photo", _why_no_exposure(requested, stops))
     if not has_semantics:
-        why = (
-            "no teacher features: rendering only"
-            if train.semantics
-            else ("train.semantics is false")
-        )
-        if train.semantics and train.features == "lifted":
-            why = "train.features is lifted: they follow the training"
-        job.left_out("semantic branch", why)
+        job.left_out("semantic branch", "colours alone are trained: no teacher's features are read")
     if train.without != "nothing":
         job.left_out(f"{train.without} of the printed method", "train.without")
     unneeded = {
         "pruning": [(not train.prune, "train.prune is false")],
-        "densification": [(given.densify == "off", "train.densify is off")],
+        "densification": [(requested.densify == "off", "train.densify is off")],
         "SH pruning": [(not train.sh_prune, "train.sh_prune is false")],
     }
     for what, reasons in unneeded.items():
@@ -183,13 +169,13 @@ def model_of(
     capture: Capture | None = None,
 ) -> SceneModel:
     """The scene before training: a Gaussian at each point, or those of `train.start`; modules drawn
-    by the training's
-    seed. train: resolved; backend: of `rasterize`; capture: that shows in which frame `train.start`
-      lies.
+    by the training's seed.
+
+    Args: train: resolved; backend: of `rasterize`; capture: to find the frame of `train.start`.
     """
     torch.manual_seed(train.seed)
     if train.start:
-        initial = started(Path(train.start), points, train, capture)
+        initial = read_start(Path(train.start), points, train, capture)
     else:
         assert train.opacity is not None
         initial = initial_gaussians(points.means, points.colors, points.covariances, train.opacity)
@@ -206,10 +192,9 @@ def model_of(
 def start_features(
     model: SceneModel, capture: Capture, points: Points, features: Features, progress: Progress
 ) -> int:
-    """Features begin as what the teacher says of the Gaussians where they are, by one pass over the
-    training views.
+    """Initialise features by lifting the teacher's to the Gaussians, by one pass over views.
 
-    Returns: of how many Gaussians anything is said.
+    Returns: number of Gaussians with features.
     Choices: means of the views, without steps towards their median: training follows.
     """
     cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
@@ -224,16 +209,15 @@ def start_features(
     return int(lifted.features.any(1).sum())
 
 
-def started(
+def read_start(
     ply: Path, points: Points, train: TrainSection, capture: Capture | None
 ) -> dict[str, Tensor]:
-    """Raw parameters of the Gaussians of a splat, brought into the frame of the scene's cameras,
-    with its SH bands.
+    """Raw parameters of a splat's Gaussians, with SH bands, in the frame of the scene's cameras.
 
     Raises: InputError naming the file, as `in_frame` does; ConfigError where they are more than
       `train.max_gaussians`.
-    Choices: Gaussians of one colour, which tells nothing, take that of the nearest of the scene's
-      points: a training moves colours too slowly to find them.
+    Choices: Gaussians all of one colour take that of the nearest of the scene's points: a training
+      moves colours too slowly to find them.
     """
     world = HERE if capture is None else World.read(capture.source)
     parameters, degree, _ = read_splats(ply, world)
@@ -262,7 +246,7 @@ def started(
 
 
 def within_cap(job: Job, points: Points) -> Points:
-    """The points that a training starts from: all, or as many as `max_gaussians` lets in."""
+    """The points that a training starts from: all, or `max_gaussians` of them."""
     n, most = len(points.means), job.config.train.max_gaussians
     if n > most:
         job.left_out(f"{n - most} of {n} initial points", f"train.max_gaussians is {most}")

@@ -1,4 +1,4 @@
-"""Training settings that the config leaves open, decided once from what is known of the scene."""
+"""Defaults of training settings that the config leaves open, decided by evidence of the scene."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.points import Points
-from chebsplat.settings import MOST_STEPS, PRINTED, TrainSection
+from chebsplat.settings import FEWEST_STEPS, PRINTED, TrainSection, default_steps
 from chebsplat.stages.training.views import disagreement, training_rows
 
 OPEN = (None, "auto")  # values of a setting that leave it open
-FEWEST = 1000  # steps that a training has by default, at least; below it rates rise no further
 PUBLISHED = 30_000  # steps that 3DGS's rates are for
 TRAVEL, FASTEST = 10.0, 5e-2  # a features' rate: less than TRAVEL over all steps does not arrive
 DEPTH_WEIGHT = 0.8
-MOST_APART = 0.003  # of its depth, where views still tell the same of a point
+MOST_APART = 0.003  # of a point's depth, within which views agree on it
 LIFTED_FROM = 40  # views
-LEAST_SPREAD = 0.05  # stops between the photos' own exposures, from which on they are undone
+LEAST_SPREAD = 0.05  # stops between the photos' own exposures, from which on these are undone
 
 
 @dataclass(frozen=True)
@@ -29,9 +28,9 @@ class Evidence:
 
     n_views, n_pixels: of the training photos, in all.
     points_measured: initial points lie on measured surfaces.
-    no_depth: why measured depth is not relied on ("": it is).
-    labels: where labels with a confidence come from: `none`, `taught`, `given` (by the source);
-      None: no teacher.
+    no_depth: reason for not using measured depth ("": it is used).
+    labels: origin of labels with a confidence: `none`, `taught` (by the teacher), `given` (by the
+      source); None: no teacher.
     exposure_spread: of the photos' own exposures, stops; None: not measured.
     """
 
@@ -45,52 +44,42 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Default:
-    """Rule for an open setting: `value` of the section so far and the evidence; `by`: in words, for
-    the docs.
-    """
+    """Rule for an open setting: `value` of the section so far and the evidence; by: in words."""
 
     value: Callable[[TrainSection, Evidence], Any]
     by: str
 
 
-def _steps(_: TrainSection, evidence: Evidence) -> int:
-    """By held-out training views (docs/results/training.md, "How many steps"): the more there is to
-    see, the longer a training gains. 70 photos of 320×240 pixels are best served by 1500 steps, and
-    with 3000 lose 0.5 dB again; 43 of 360×640 gain until 3000.
-    """
-    return min(max(100 * round(2.8 * evidence.n_pixels / 1e6), FEWEST), MOST_STEPS)
-
-
 def _feature_every(_: TrainSection, evidence: Evidence) -> int:
-    """One step in four teaches features as well as every one, for less than half of what they add
-    to a step's time. Where views are few, features hold the Gaussians in place, too (ten views:
-    24.3 dB, and 23.1 in one of four).
+    """Features in one step of four are as accurate as in each, for less than half of their time.
+
+    With few views they also regularise the Gaussians (ten views: 24.3 dB; one step of four: 23.1).
     """
     return min(max(evidence.n_views // 10, 1), 4)
 
 
 def _feature_start(_: TrainSection, evidence: Evidence) -> str:
-    """Where views are few, features that are there from the first step pull Gaussians towards what
-    single views show
-    (six, ten, twenty views of one room: 3.6, 3.6 and 1.0 dB less; seventy: none).
+    """Zero for few views: features from the first step then make Gaussians overfit single views.
+
+    Six, ten and twenty views of one room lose 3.6, 3.6 and 1.0 dB by them; seventy none.
     """
     return "lifted" if evidence.n_views >= LIFTED_FROM else "zero"
 
 
 def _by_steps(published: float, power: float) -> Default:
-    """A rate of 3DGS's for trainings of fewer steps, which must each go further.
+    """A learning rate of 3DGS, raised for fewer steps.
 
     Powers are from 1000-step trainings of office0 and fox, where means 8 times, scales and
-    rotations 3 times and colours 4 times as fast were best on held-out training views; 1 from
-    30,000 steps on.
+    rotations 3 times and colours 4 times as fast were best on held-out training views; from 30,000
+    steps on the rate is 3DGS's.
     """
 
     def rate(train: TrainSection, _: Evidence) -> float:
         assert train.steps is not None
-        return published * max(PUBLISHED / max(train.steps, FEWEST), 1) ** power
+        return published * max(PUBLISHED / max(train.steps, FEWEST_STEPS), 1) ** power
 
     return Default(
-        rate, f"steps, taken as {FEWEST} to 30,000: {published:g} (30,000 / steps)^{power:g}"
+        rate, f"steps, taken as {FEWEST_STEPS} to 30,000: {published:g} (30,000 / steps)^{power:g}"
     )
 
 
@@ -104,8 +93,11 @@ def _exposure(_: TrainSection, evidence: Evidence) -> str:
     return "off" if spread is None or spread < LEAST_SPREAD else "measured"
 
 
-DEFAULTS = {  # in this order: a later one may ask for an earlier
-    "steps": Default(_steps, "pixels of the training photos: 280 a megapixel, from 1000 to 3000"),
+DEFAULTS = {  # in this order: a later one may depend on an earlier
+    "steps": Default(
+        lambda _, evidence: default_steps(evidence.n_pixels),
+        "pixels of the training photos: 280 a megapixel, from 1000 to 3000",
+    ),
     "feature_every": Default(
         _feature_every, "training views: a tenth of their number, from 1 to 4"
     ),
@@ -139,16 +131,14 @@ DEFAULTS = {  # in this order: a later one may ask for an earlier
 }
 
 
-WITHOUT: dict[str, dict[str, Any]] = {  # rows of Table 5 that the trainer sees to
+WITHOUT: dict[str, dict[str, Any]] = {  # rows of Table 5 that are settings of the trainer
     "densification": {"densify": "off"},
     "pruning guidance": {"densify_semantic": False},
 }
 
 
 def resolved(train: TrainSection, evidence: Evidence) -> TrainSection:
-    """The section with every setting that it leaves open decided, and those of the printed method
-    as it has them.
-    """
+    """The section with every open setting decided, and the printed method's settings in place."""
     if train.method == "printed":
         train = train.model_copy(update=PRINTED | WITHOUT.get(train.without, {}))
     for name, default in DEFAULTS.items():
@@ -158,11 +148,9 @@ def resolved(train: TrainSection, evidence: Evidence) -> TrainSection:
 
 
 def decided(
-    train: TrainSection, done: TrainSection, with_features: bool
+    train: TrainSection, final: TrainSection, with_features: bool
 ) -> dict[str, dict[str, Any]]:
-    """Value and evidence, by name, of each setting that `train` leaves open and the training
-    uses.
-    """
+    """Value, of `final`, and reason of each setting that `train` leaves open and that is in use."""
     unused = (
         set()
         if with_features
@@ -172,16 +160,15 @@ def decided(
     names = [name for name in DEFAULTS if getattr(train, name) in OPEN and name not in unused]
     printed = PRINTED if train.method == "printed" else {}
     by = {name: "the printed method" if name in printed else DEFAULTS[name].by for name in names}
-    return {name: {"value": getattr(done, name), "by": by[name]} for name in names}
+    return {name: {"value": getattr(final, name), "by": by[name]} for name in names}
 
 
 def evidence_of(
     train: TrainSection, capture: Capture, points: Points, features: Features | None
 ) -> Evidence:
-    """Evidence for the open settings, but for the photos' exposures; only what they ask for is
-    measured.
+    """Evidence for the open settings, but for the photos' exposures; measures only what is needed.
 
-    Raises: ConfigError where the teacher has not what `train.feature_loss` asks for, InputError if
+    Raises: ConfigError where the teacher lacks the labels of `train.feature_loss`, InputError if
       capture and points do not belong together, DataFailure without a training view.
     """
     n_views = len(training_rows(capture, points))
@@ -207,11 +194,11 @@ def evidence_of(
 
 
 def _why_no_depth(capture: Capture, points: Points) -> str:
-    """Reason for not relying on measured depth ("": it is relied on).
+    """Reason for not using measured depth ("": it is used).
 
-    Choices: not if the capture has no poses, since its unit is not the scene's then, nor if its
-      views contradict one another, as a sensor's do: its noise and its place beside the colour
-      camera would be taught. Swept depth is only where views agree.
+    Choices: not without poses in the capture, since its unit is not the scene's then, nor where
+      views contradict one another, as a sensor's do, whose noise and offset from the colour camera
+      would be learned. Swept depth exists only where views agree.
     """
     if capture.depth is None and points.depths is not None:
         return ""

@@ -19,9 +19,7 @@ FEW = 20  # a class of fewer Gaussians has no mean worth comparing
 def facts_of(
     job: Job, trainer: Trainer, parameters: dict[str, np.ndarray], features: Features | None
 ) -> dict[str, Any]:
-    """Facts of a finished training with these final parameters: what semantics changed, seconds,
-    memory.
-    """
+    """Facts of a finished training with these final parameters: guidance, seconds, memory."""
     facts: dict[str, Any] = {}
     if features is not None:
         mask = trainer.final_mask()
@@ -39,33 +37,31 @@ def facts_of(
 
 
 def printed_facts(model: PrintedScene, features: Features) -> dict[str, Any]:
-    """Facts of a printed training: histograms of gates and masks, and what encodings alone know.
+    """Facts of a printed training: histograms of gates and masks, and accuracy of encodings.
 
     `agreement`: share of Gaussians whose label by shape features equals that by their own;
-      `commonest`: share with the
-    commonest label, which an encoder that knows nothing reaches; `ranks_before`: of the bases of
-    the scenes before.
+    `commonest`: share with the commonest label, the agreement of a constant encoder;
+    `ranks_before`: of the bases of the scenes before.
     """
     whole = model.whole()
-    named, wanted = (
+    named, own = (
         decode_labels(values.detach().cpu().numpy(), features.label_embeddings)
         for values in (whole.shape, model.raw["features"])
     )
-    facts = {"histograms": model.histograms(), "agreement": float((named == wanted).mean())}
-    facts["commonest"] = float(np.bincount(wanted).max() / len(wanted))
+    facts = {"histograms": model.histograms(), "agreement": float((named == own).mean())}
+    facts["commonest"] = float(np.bincount(own).max() / len(own))
     return facts | {"ranks_before": {name: basis.shape[1] for name, basis in model.bases.items()}}
 
 
 def guidance(
     parameters: dict[str, np.ndarray], mask: np.ndarray | None, embeddings: np.ndarray
 ) -> dict[str, float | None]:
-    """What semantics changed: which Gaussians and SH bands go.
+    """Influence of semantics on the pruning of Gaussians and SH bands, by the spread over classes.
 
     Args: parameters: of a finished training; mask [N]: m̂ of its Gaussians, None without pruning;
       embeddings [L, C].
-    Returns: `mask_spread` and `band_spread`, standard deviations over classes of the mean m̂ and of
-      the mean share of SH
-      coefficients kept. None: not there.
+    Returns: `mask_spread` and `band_spread`, standard deviations over classes of the mean m̂ (None
+      without) and of the mean share of SH coefficients left.
     """
     labels = decode_labels(parameters["features"], embeddings)
 
@@ -77,8 +73,8 @@ def guidance(
             else 0.0
         )
 
-    kept = (parameters["degrees"].astype(np.float64) + 1) ** 2 / 16
+    band_share = (parameters["degrees"].astype(np.float64) + 1) ** 2 / 16
     return {
         "mask_spread": None if mask is None else spread(mask.astype(np.float64)),
-        "band_spread": spread(kept),
+        "band_spread": spread(band_share),
     }

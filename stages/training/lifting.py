@@ -1,6 +1,4 @@
-"""Features lifted to Gaussians: what the 2D teacher says of each, by one pass over the training
-views.
-"""
+"""Lifting of a 2D teacher's features to Gaussians, by one pass over the training views."""
 
 from __future__ import annotations
 
@@ -31,8 +29,7 @@ def lifted_from(
     progress: Progress,
     median_steps: int = MEDIAN_STEPS,
 ) -> lifted_format.Lifted:
-    """The features of Gaussians with these raw parameters, by the training views among these
-    cameras.
+    """Features of Gaussians with these raw parameters, by the training views among these cameras.
 
     Args: gate: `lift.gate`; median_steps: from the mean of the views on.
     Raises:  InputError if artifacts do not belong together, DataFailure if no view sees a Gaussian.
@@ -45,20 +42,18 @@ def lifted_from(
     if len(observations.views) == 0:
         raise DataFailure(
             "no training view sees a Gaussian that the teacher has features for; check that splat "
-            "and cameras are in "
-            "the same frame"
+            "and cameras are in the same frame"
         )
-    found = estimate(observations, median_steps, LEAST_WEIGHT)
+    estimates = estimate(observations, median_steps, LEAST_WEIGHT)
     notes = {"views": names, "n_observations": len(observations.views)}
     return lifted_format.Lifted(
-        **{name: np.ascontiguousarray(values) for name, values in vars(found).items()}, notes=notes
+        **{name: np.ascontiguousarray(values) for name, values in vars(estimates).items()},
+        notes=notes,
     )
 
 
 def training_names(capture: Capture, cameras: Cameras, features: Features) -> list[str]:
-    """Names of the training views with a camera, in its order. Raises InputError where artifacts do
-    not fit.
-    """
+    """Names of the training views with a camera, in its order. Raises InputError, DataFailure."""
     is_test = dict(zip(capture.names, capture.is_test.tolist(), strict=True))
     if unknown := [name for name in cameras.names if name not in is_test]:
         raise InputError(
@@ -70,8 +65,8 @@ def training_names(capture: Capture, cameras: Cameras, features: Features) -> li
             "the cameras are of another size than the capture; pass artifacts of one scene"
         )
     names = [name for name in cameras.names if not is_test[name]]
-    known = set(features.names)
-    if absent := [name for name in names if name not in known]:
+    available = set(features.names)
+    if absent := [name for name in names if name not in available]:
         raise InputError(
             f"the features have no view {absent[0]}; run the teacher stage on this capture"
         )
@@ -90,30 +85,32 @@ def lifted_views(
     names: list[str],
     gate: float,
 ) -> Iterator[Lifted]:
-    """What each of these views says of the Gaussians."""
+    """Weighted sums of each of these views' features by Gaussian."""
     p = parameters
     gaussians = p["means"], p["quats"], np.exp(p["log_scales"]), expit(p["logit_opacities"])
-    place, taught = ({name: k for k, name in enumerate(of.names)} for of in (cameras, features))
+    place, feature_row = (
+        {name: k for k, name in enumerate(of.names)} for of in (cameras, features)
+    )
     row = {name: k for k, name in enumerate(capture.names)}
     for name in names:
-        values = features.features[taught[name]]
+        values = features.features[feature_row[name]]
         mask = None if capture.loss_mask is None else capture.loss_mask[row[name]]
-        said, share = to_cells(
-            values, counts_of(features, taught[name], values), capture.size, mask
+        cells, share = to_cells(
+            values, counts_of(features, feature_row[name], values), capture.size, mask
         )
         camera = cameras.cam_from_world[place[name]], cameras.Ks[place[name]]
-        yield lift(gaussians, *camera, capture.size, said, share, gate)
+        yield lift(gaussians, *camera, capture.size, cells, share, gate)
 
 
 def counts_of(features: Features, view: int, values: np.ndarray) -> np.ndarray:
-    """What each entry of a view's features counts, f32 [h, w].
+    """Weight of each entry of a view's features, f32 [h, w].
 
-    Choices: nothing where the teacher has no label; its confidence where the source brought the
-      labels with one, as the loss of a training has it; 1 elsewhere.
+    Choices: 0 where the teacher has no label; the confidence of labels that the source brings, as
+      in the loss of a training; 1 elsewhere.
     """
     if features.pseudo_labels is None:
         return np.ones(values.shape[:2], np.float32)
     labelled = (features.pseudo_labels[view] >= 0).astype(np.float32)
     if features.convention.get("kind") == "given" and features.confidence is not None:
-        return labelled * features.confidence[view].astype(np.float32)  # type: ignore[no-any-return]
-    return labelled
+        labelled *= features.confidence[view].astype(np.float32)
+    return np.asarray(labelled)

@@ -21,21 +21,21 @@ log = logging.getLogger("chebsplat")
 def follow(job: Job, trainer: Trainer) -> list[dict[str, float]]:
     """Run the steps, from the last save where there is one; returns the trace.
 
-    A row holds means of the losses since the row before; its seconds count training alone, not the
-    held-in measurements.
+    A row holds means of the losses since the row before; its seconds are those of training alone,
+    without measurements.
     """
     n_views = len(trainer.views.names)
     watched = list(range(0, n_views, max(n_views // 4, 1)))[:4]
     saves, train = Saves(job), trainer.settings
     trace: list[dict[str, float]] = []
     since: list[dict[str, float | Tensor]] = []
-    if (held := saves.load()) is not None:
-        trainer.load_state_dict(held["trainer"])
-        trace, since = held["trace"], held["since"]
-        job.facts["resumed_at"] = [*held["resumed_at"], trainer.step]
+    if (saved := saves.load()) is not None:
+        trainer.load_state_dict(saved["trainer"])
+        trace, since = saved["trace"], saved["since"]
+        job.facts["resumed_at"] = [*saved["resumed_at"], trainer.step]
         log.info("resumed at step %d", trainer.step)
-    with deferred() as asked:
-        # the features' is in one step of so many
+    with deferred() as request:
+        # features have a loss in one step of so many
         losses: deque[float | Tensor] = deque(maxlen=trainer.feature_every)
         rounds = job.progress.track(
             trainer.steps(), lambda: expected(trainer), "train", start=trainer.step
@@ -43,15 +43,16 @@ def follow(job: Job, trainer: Trainer) -> list[dict[str, float]]:
         for figures, status in rounds:
             since.append(figures)
             if trainer.step % train.report_every == 0 or trainer.share >= 1:
-                trace.append(measured(trainer, since, watched))
+                trace.append(trace_row(trainer, since, watched))
                 since = []
                 job.progress.record(**trace[-1])
             losses.append(figures["loss"])
             if trainer.reads:
                 mean = np.mean([float(loss) for loss in losses])
-                status |= {"mean loss": f"{mean:.4f}", "gaussians": figures["n"]} | shown(trace)
-            saves.offer(partial(state, trainer, trace, since, job), now=asked.stop is not None)
-            if asked.stop is not None:
+                status |= {"mean loss": f"{mean:.4f}", "gaussians": figures["n"]}
+                status |= describe_last(trace)
+            saves.offer(partial(state, trainer, trace, since, job), now=request.stop is not None)
+            if request.stop is not None:
                 log.info("saved at step %d; the same command goes on from there", trainer.step)
                 break
     columns = sorted(
@@ -60,29 +61,25 @@ def follow(job: Job, trainer: Trainer) -> list[dict[str, float]]:
     return [{k: row.get(k, 0.0) for k in columns} for row in trace]
 
 
-def measured(
+def trace_row(
     trainer: Trainer, since: list[dict[str, float | Tensor]], watched: list[int]
 ) -> dict[str, float]:
-    """A row of the trace, from the figures of steps since the row before and the PSNR of the
-    training views watched.
-    """
+    """A row of the trace: figures of steps since the row before, PSNR of watched training views."""
     row: dict[str, float | Tensor] = {
         "step": trainer.step,
         "seconds": trainer.seconds,
         "n": since[-1]["n"],
     }
     for name in {name for entry in since for name in entry} - row.keys():
-        # the features' is in some steps only
+        # features have a loss in some steps only
         values = [entry[name] for entry in since if name in entry]
         row[name] = sum(values) / len(values)
     row |= {"psnr": trainer.held_in_psnr(watched), "sh_kept": trainer.model.sh_kept()}
     return {k: float(v) for k, v in row.items()}
 
 
-def shown(trace: list[dict[str, float]]) -> dict[str, str]:
-    """What the progress line says of the last measurement: on views that are trained on, not on
-    test views.
-    """
+def describe_last(trace: list[dict[str, float]]) -> dict[str, str]:
+    """The last measurement, on training views, for the progress line."""
     return (
         {"train PSNR": f"{trace[-1]['psnr']:.2f}", "sh": f"{trace[-1]['sh_kept']:.0%}"}
         if trace
@@ -91,7 +88,7 @@ def shown(trace: list[dict[str, float]]) -> dict[str, str]:
 
 
 def expected(trainer: Trainer) -> int:
-    """How many steps there will be, for the progress line."""
+    """Expected number of steps, for the progress line."""
     return trainer.schedule.last_step(trainer.step, trainer.seconds)
 
 
@@ -101,6 +98,6 @@ def state(
     since: list[dict[str, float | Tensor]],
     job: Job,
 ) -> dict[str, Any]:
-    """All that a resumed training goes on from."""
+    """The state that a training resumes from."""
     resumed = job.facts.get("resumed_at", [])
     return {"trainer": trainer.state_dict(), "trace": trace, "since": since, "resumed_at": resumed}

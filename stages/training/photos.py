@@ -1,4 +1,4 @@
-"""Exposures of single photos, which a training can undo."""
+"""Exposures of the training photos, which a training can undo."""
 
 from __future__ import annotations
 
@@ -17,22 +17,18 @@ def own_exposures(capture: Capture, points: Points) -> tuple[np.ndarray, dict[st
     spread of `all` and of these `own` parts, None where no exposure is known. A second or two.
     """
     measured, poses = exposures_of(capture, points)
-    known = measured[np.isfinite(measured).all(1)]
+    finite = measured[np.isfinite(measured).all(1)]
     own = own_part(measured, poses)
     return own, {
-        "all": float(known.std(0).mean()) if len(known) else None,
+        "all": float(finite.std(0).mean()) if len(finite) else None,
         "own": float(own.std(0).mean()),
     }
 
 
 def exposures_of(capture: Capture, points: Points) -> tuple[np.ndarray, np.ndarray]:
-    """Exposures of the training views in stops, by the points' tracks where they have any; and
-    these views' poses.
-    """
-    row, used = (
-        {name: view for view, name in enumerate(capture.names)},
-        training_rows(capture, points),
-    )
+    """Exposures of the training views in stops, by the points' tracks, if any; and their poses."""
+    row = {name: view for view, name in enumerate(capture.names)}
+    used = training_rows(capture, points)
     tracks = None
     if len(points.tracks):
         column = np.full(len(points.names), -1)

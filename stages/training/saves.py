@@ -1,4 +1,4 @@
-"""An interrupted training goes on where it was last saved, to the same bytes."""
+"""Saves of a training, from which an interrupted one resumes to the same bytes."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from chebsplat.stages.runtime.command import Job, n_threads
 
 log = logging.getLogger("chebsplat")
 SECONDS = 30.0  # between two saves
-LAYOUT = 3  # of a state: one of another layout is not gone on from
+LAYOUT = 3  # of a state: one of another layout is not resumed
 
 
 class Saves:
-    """States of one training, the last one kept, in the job's scratch folder.
+    """Saves of the state of one training in the job's scratch folder; the last one stays.
 
     A state fits only the same settings, inputs, package versions, device and number of threads:
-    from another one the training starts anew and says so.
+    otherwise the training starts anew, with a warning.
     """
 
     def __init__(self, job: Job):
@@ -47,27 +47,25 @@ class Saves:
         if not self.file.is_file():
             return None
         try:
-            held = torch.load(self.file, weights_only=True)
-        except Exception as error:  # whatever a damaged file makes torch raise
+            save = torch.load(self.file, weights_only=True)
+        except Exception as error:  # torch raises any kind on a damaged file
             log.warning("%s is damaged (%s): training starts anew", self.file, error)
             return None
-        if held["identity"] != self.identity:
+        if save["identity"] != self.identity:
             log.warning("%s is of another training: this one starts anew", self.file)
             return None
         self.job.watch.go_on(self.job.scratch)
-        return dict(held["state"])
+        return dict(save["state"])
 
     def offer(self, state: Any, now: bool = False) -> None:
-        """Save what `state()` returns if the last save is long ago, or `now`: whole or not at
-        all.
-        """
+        """Save `state()`, whole or not at all, if the last save is long ago, or `now`."""
         if not now and time.monotonic() - self.saved < SECONDS:
             return
 
-        self.saved, held = time.monotonic(), {"identity": self.identity, "state": state()}
+        self.saved, save = time.monotonic(), {"identity": self.identity, "state": state()}
         try:
             with atomic_path(self.file) as temporary, temporary.open("wb") as handle:
-                torch.save(held, handle)
+                torch.save(save, handle)
             self.job.watch.keep(self.job.scratch)
         except (OSError, RuntimeError) as error:  # torch has its own word for a full disk
             log.warning("%s cannot be saved (%s): the training goes on without", self.file, error)

@@ -1,6 +1,4 @@
-"""How far the labels that a source brings are met on training views, by a teacher and by
-Gaussians.
-"""
+"""Accuracy against a source's labels on training views, of a teacher and of Gaussians."""
 
 from __future__ import annotations
 
@@ -14,21 +12,19 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.labels.decode import decode_labels
 
-N_VIEWS, N_PIXELS = 16, 256  # training views that are looked at, and pixels of each
+N_VIEWS, N_PIXELS = 16, 256  # training views, and pixels of each
 SEED = 0  # of the choice of pixels
 
 
 def labels_right(
     capture: Capture, parameters: dict[str, np.ndarray], features: np.ndarray, teacher: Features
 ) -> float | None:
-    """Share of some pixels of training views that the Gaussian nearest to their surface gives the
-    true label; None where the capture has no labels with depth and poses. No test view is looked
-    at.
+    """Accuracy of Gaussians' labels at the surface in some pixels of training views, by the nearest
+    Gaussian; None where the capture has no labels with depth and poses. Test views take no part.
 
-    Args: parameters: raw, of N Gaussians; features [N, C]; teacher: whose labels they are decoded
-      to.
-    Choices: Gaussians that are half transparent are no surface. Pixels of classes that are none of
-      the teacher's labels are not asked.
+    Args: parameters: raw, of N Gaussians; features [N, C]; teacher: with labels to decode to.
+    Choices: Gaussians of opacity below one half are no surface. Pixels of classes that are none of
+      the teacher's labels do not count.
     """
     if capture.labels is None or capture.depth is None or capture.cam_from_world is None:
         return None
@@ -49,13 +45,13 @@ def labels_right(
     if not len(solid) or not sum(map(len, truth)):
         return None
     nearest = solid[cKDTree(parameters["means"][solid]).query(np.concatenate(points))[1]]
-    said = decode_labels(features[nearest], teacher.label_embeddings)
-    return float((said == np.concatenate(truth)).mean())
+    predicted = decode_labels(features[nearest], teacher.label_embeddings)
+    return float((predicted == np.concatenate(truth)).mean())
 
 
 def pixels_right(capture: Capture, teacher: Features) -> float | None:
-    """Share of the pixels of training views that a teacher's pseudo labels name rightly, where -1
-    is as wrong as any other; None where the capture has no labels.
+    """Pixel accuracy of a teacher's pseudo labels on training views, -1 counting as wrong; None
+    where the capture has no labels.
     """
     if capture.labels is None or teacher.pseudo_labels is None:
         return None

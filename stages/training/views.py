@@ -1,6 +1,4 @@
-"""The training views of a scene, joined by name from its artifacts: photos, masks, features, labels
-and depth.
-"""
+"""Training views of a scene, joined by name: photos, masks, features, labels and depth."""
 
 from __future__ import annotations
 
@@ -18,12 +16,12 @@ from chebsplat.formats.points import Points
 from chebsplat.photos.exposures import relit
 from chebsplat.views import TaughtLabels, Views, remembered, stacked
 
-# of features that are kept in memory; what is beyond is read when its view is looked at
+# of features that are cached in memory; others are read when their view is used
 FEATURE_BYTES = 64 << 20
 # of photos, masks and depth likewise
 PHOTO_BYTES, MASK_BYTES, DEPTH_BYTES = 2 << 30, 512 << 20, 512 << 20
 N_PAIRS, N_PIXELS = 100, 1000  # views whose depths are compared, and pixels of each
-SAME = 0.1  # of its depth, beyond which what one view sees is hidden from the other
+SAME = 0.1  # of its depth, beyond which one view's point is hidden from the other
 
 
 def training_rows(capture: Capture, points: Points) -> list[int]:
@@ -50,18 +48,15 @@ def training_views(
     with_depth: bool = False,
     exposures: np.ndarray | None = None,
 ) -> Views:
-    """The registered training views, joined by name, with their depth where asked for, and without
-    these exposures [V, 3], in stops.
+    """The registered training views, joined by name, with exposures [V, 3], in stops, undone.
 
     Raises: InputError if artifacts do not belong together, DataFailure without a training view.
     """
-    row, used = (
-        {name: view for view, name in enumerate(capture.names)},
-        training_rows(capture, points),
-    )
+    row = {name: view for view, name in enumerate(capture.names)}
+    used = training_rows(capture, points)
     names = [points.names[k] for k in used]
     images, masks = capture.images, capture.loss_mask
-    chosen = [row[name] for name in names]
+    rows = [row[name] for name in names]
     of = labels_of = None
     if features is not None:
         source = {name: view for view, name in enumerate(features.names)}
@@ -82,18 +77,18 @@ def training_views(
             labels_of = taught_labels(features, [source[name] for name in names])
 
     def photo(k: int) -> torch.Tensor:
-        image = images[chosen[k]]
+        image = images[rows[k]]
         return torch.from_numpy(image if exposures is None else relit(image, -exposures[k]))
 
     depth_of = measured_depth(capture, points, used) if with_depth else None
     return Views(
         names,
-        stacked(photo, len(chosen), PHOTO_BYTES),
+        stacked(photo, len(rows), PHOTO_BYTES),
         torch.from_numpy(points.Ks[used]).float(),
         torch.from_numpy(points.cam_from_world[used]).float(),
         None
         if masks is None
-        else stacked(lambda k: torch.from_numpy(masks[chosen[k]]), len(chosen), MASK_BYTES),
+        else stacked(lambda k: torch.from_numpy(masks[rows[k]]), len(rows), MASK_BYTES),
         of,
         labels_of,
         depth_of,
@@ -101,9 +96,7 @@ def training_views(
 
 
 def taught_labels(features: Features, rows: list[int]) -> Callable[[int], TaughtLabels]:
-    """The labels of the training views, whose rows in the features these are; FEATURE_BYTES of a
-    kind are kept.
-    """
+    """Labels by index of training view, of these rows of the features; cached."""
     labels, confidence, codes = (
         features.pseudo_labels,
         features.confidence,
@@ -118,8 +111,8 @@ def taught_labels(features: Features, rows: list[int]) -> Callable[[int], Taught
     )
 
     def of(index: int) -> TaughtLabels:
-        found = classes(index)
-        return TaughtLabels(found, certainty(index), codes, bool((found >= 0).all()))
+        of_view = classes(index)
+        return TaughtLabels(of_view, certainty(index), codes, bool((of_view >= 0).all()))
 
     return of
 
@@ -127,11 +120,10 @@ def taught_labels(features: Features, rows: list[int]) -> Callable[[int], Taught
 def measured_depth(
     capture: Capture, points: Points, used: list[int]
 ) -> Callable[[int, int], Tensor]:
-    """z-depth, every so many pixels, of the views of the points that have these indices: the
-    capture's, otherwise what was swept, 0 where neither tells.
+    """z-depth, by index into `used` and step of pixels, of these views of the points: the
+    capture's, otherwise swept depth, 0 unknown.
 
-    Raises: ConfigError where there is none, or where its unit is not the scene's, as poses are not
-      the capture's own.
+    Raises: ConfigError where there is none in the scene's unit.
     """
     depth, swept, (width, height) = capture.depth, points.depths, capture.size
     if depth is not None and capture.cam_from_world is not None:
@@ -155,8 +147,7 @@ def measured_depth(
     else:
         raise ConfigError(
             "train.weight_depth needs a capture with poses and depth, and this one has no depth; "
-            "set it to 0, or sweep "
-            "the photos for it (sfm.dense=on)"
+            "set it to 0, or sweep the photos for it (sfm.dense=on)"
         )
 
     def at(index: int, factor: int) -> Tensor:
@@ -167,8 +158,8 @@ def measured_depth(
 
 
 def disagreement(capture: Capture, points: Points) -> float:
-    """Median over points of |z' / z - 1|, z' from one training view's depth and z what another sees
-    there; 0 if no two views see a point in common, or there are none.
+    """Median over points of |z' / z - 1|, of depths z' and z in two training views; 0 if no two
+    views see a point in common.
     """
     assert capture.depth is not None
     row, rng = {name: view for view, name in enumerate(capture.names)}, np.random.default_rng(0)
@@ -179,15 +170,15 @@ def disagreement(capture: Capture, points: Points) -> float:
         pixels = np.stack([rng.integers(0, side, N_PIXELS) for side in one.shape], 1)
         pixels = pixels[one[pixels[:, 0], pixels[:, 1]] > 0]  # nan is none
         world = unproject(one, points.Ks[a], points.cam_from_world[a], pixels)
-        seen = (
+        projected = (
             world @ points.cam_from_world[b, :3, :3].T + points.cam_from_world[b, :3, 3]
         ) @ points.Ks[b].T
-        seen = seen[seen[:, 2] > 0]
-        column, line = (np.floor(seen[:, axis] / seen[:, 2]) for axis in (0, 1))
+        projected = projected[projected[:, 2] > 0]
+        column, line = (np.floor(projected[:, axis] / projected[:, 2]) for axis in (0, 1))
         inside = (column >= 0) & (column < other.shape[1]) & (line >= 0) & (line < other.shape[0])
         there = other[line[inside].astype(int), column[inside].astype(int)]
-        known = there > 0
-        apart = np.abs(seen[inside, 2][known] / there[known] - 1)
+        measured = there > 0
+        apart = np.abs(projected[inside, 2][measured] / there[measured] - 1)
         if a != b:
             differences.append(apart[apart < SAME])
     every = np.concatenate(differences)

@@ -11,11 +11,14 @@ from PIL import Image
 from shared import ROOT, data
 
 import benchmarks.__main__ as bench
-from benchmarks import raster
+from benchmarks import raster, shared
 from benchmarks.training import cost
 from chebsplat.stages.settings import TeachSection
 
-SETTINGS = "teacher.kind=embedded,knowledge.start=shipped,train.steps=60,evaluate.timing_repeats=1,sfm.max_points=6000"
+SETTINGS = (
+    "teacher.kind=embedded,knowledge.start=shipped,train.steps=60,evaluate.timing_repeats=1,"
+    "sfm.max_points=6000"
+)
 # of a finished toy scene: {work}, its folder of links, and {name}; {photos}: folder of a capture
 SMALLEST = {
     "raster": "--rounds 1",
@@ -102,8 +105,9 @@ def test_a_benchmark_runs_to_its_end_at_its_smallest_size(name, work, tmp_path, 
     assert name in PRINT_ALONE or list((tmp_path / "out").glob("*.csv"))
 
 
-HELD = {"torch, 4 threads": 100.0, "cpu, 4 threads": 4.0, "cpu, 1 thread": 12.0, "cpu, 3 channels": 3.0,
-        "cpu, 100k": 6.0, "training step, 3 colors": 10.0, "training step, 32 features by cell": 12.0}  # fmt: skip
+HELD = {"torch, 4 threads": 100.0, "cpu, 4 threads": 4.0, "cpu, 1 thread": 12.0,
+        "cpu, 3 channels": 3.0, "cpu, 100k": 6.0, "training step, 3 colors": 10.0,
+        "training step, 32 features by cell": 12.0}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -128,7 +132,19 @@ def test_the_rasterizer_s_benchmark_ends_with_1_where_a_bar_is_missed(
     assert ("MISSED" in capsys.readouterr().out) == bool(code)
 
 
-@pytest.mark.parametrize(("ratio", "code"), [(1.2, 0), (1.3, 1)])
+@pytest.mark.parametrize(
+    ("value", "relation", "met"),
+    [(1.0, ">=", True), (0.9, ">=", False), (1.0, "<=", True), (1.1, "<=", False)]
+    + [(float("nan"), relation, False) for relation in (">=", "<=")],
+)
+def test_a_bar_is_met_from_its_value_on_and_never_by_what_was_not_measured(
+    capsys, value, relation, met
+):
+    assert shared.judged([("first", 1.0, "<=", 2.0), ("what", value, relation, 1.0)]) == [True, met]
+    assert ("MISSED" in capsys.readouterr().out) == (not met)
+
+
+@pytest.mark.parametrize(("ratio", "code"), [(1.2, 0), (1.3, 1), (float("nan"), 1)])
 def test_the_cost_of_a_training_ends_with_1_where_its_bar_is_missed(
     tmp_path, monkeypatch, capsys, ratio, code
 ):

@@ -88,8 +88,8 @@ def test_whatever_a_kill_leaves_is_written_anew(tmp_path, whole, left):
     else:
         (folder / "features/zarr.json").unlink()
     writer = FeatureWriter(folder, NAMES, SHAPE)
-    assert writer.done == ({1, 3} if left == "no metadata" else {3})
-    for k in set(range(4)) - writer.done:
+    assert writer.finished == ({1, 3} if left == "no metadata" else {3})
+    for k in set(range(4)) - writer.finished:
         writer.add(k, *view(k))
     assert finished(writer, tmp_path / "out") == whole
 
@@ -102,7 +102,7 @@ from chebsplat.formats.features import FeatureWriter
 views = np.load(sys.argv[1])
 writer = FeatureWriter(Path(sys.argv[2]), json.loads(sys.argv[3]), views["features"].shape[1:])
 print("ready", flush=True)
-for k in sorted(set(range(len(writer.names))) - writer.done):
+for k in sorted(set(range(len(writer.names))) - writer.finished):
     writer.add(k, views["features"][k], views["labels"][k], views["confidence"][k])
     print(k, flush=True)
 """
@@ -143,8 +143,11 @@ def test_killed_at_random_moments_it_goes_on_and_leaves_the_same_bytes(tmp_path,
 )
 def test_views_of_other_names_shape_or_settings_are_not_taken_over(tmp_path, other):
     written(tmp_path / "w", [0])
-    assert FeatureWriter(tmp_path / "w", NAMES, SHAPE).done == {0}
-    assert FeatureWriter(tmp_path / "w", **({"names": NAMES, "shape": SHAPE} | other)).done == set()
+    assert FeatureWriter(tmp_path / "w", NAMES, SHAPE).finished == {0}
+    assert (
+        FeatureWriter(tmp_path / "w", **({"names": NAMES, "shape": SHAPE} | other)).finished
+        == set()
+    )
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e6], ids=["nan", "inf", "too large"])
@@ -153,7 +156,7 @@ def test_a_value_that_float16_cannot_hold_is_refused_with_the_view(tmp_path, bad
     values[3, 4, 1] = bad
     with pytest.raises(ValueError, match="view c: features hold 1 non-finite"):
         writer.add(2, values)
-    assert writer.done == set()
+    assert writer.finished == set()
 
 
 def test_a_wrong_shape_is_refused_with_the_view(tmp_path):

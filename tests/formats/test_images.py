@@ -32,7 +32,7 @@ def test_an_image_that_is_a_program_is_never_run(tmp_path, monkeypatch, how):
     read = {
         "ingest": lambda: alone(folder),
         "channels": lambda: list(channels.photos([folder / "b.png"])),
-        "check-teacher": lambda: get_teacher.shown(folder / "b.png"),
+        "check-teacher": lambda: get_teacher.read_photo(folder / "b.png"),
     }[how]
     with pytest.raises(InputError, match=r"b\.png is no PNG, JPEG or HEIC"):
         read()

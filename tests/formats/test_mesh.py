@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from chebsplat.errors import ConfigError
-from chebsplat.formats.meshes import Frame, Mesh, cleaned, fused, write_mesh
-from chebsplat.stages.tools.mesh import STEP, away, noted, without_edges
+from chebsplat.formats.meshes import Frame, Mesh, clean_mesh, fuse_depth, write_mesh
+from chebsplat.stages.tools.mesh import STEP, away, collect_points, drop_edges
 from chebsplat.synthetic.rays import intrinsics, look_at, open3d
 
 SIZE = 96, 72
@@ -36,7 +36,7 @@ def of_a_ball(radius=0.5):
 
 @pytest.fixture(scope="module")
 def ball():
-    return fused(open3d(), of_a_ball(), 0.02, 5.0)
+    return fuse_depth(open3d(), of_a_ball(), 0.02, 5.0)
 
 
 def test_a_fused_mesh_lies_on_the_surface_in_the_cameras_world_and_bears_its_colour(ball):
@@ -50,7 +50,7 @@ def test_a_fused_mesh_lies_on_the_surface_in_the_cameras_world_and_bears_its_col
 
 def test_a_mesh_is_as_far_from_the_depth_of_its_views_as_it_was_moved(ball):
     points = []
-    assert len(list(noted(of_a_ball(), points))) == 36
+    assert len(list(collect_points(of_a_ball(), points))) == 36
     seen = np.concatenate(points)
     assert 36 * 50 < len(seen) < 36 * 150
     np.testing.assert_allclose(np.linalg.norm(seen, axis=1), 0.5, atol=1e-3)
@@ -61,7 +61,7 @@ def test_a_mesh_is_as_far_from_the_depth_of_its_views_as_it_was_moved(ball):
 
 def test_views_without_depth_make_an_empty_mesh():
     frame = next(of_a_ball())
-    empty = fused(open3d(), [frame._replace(depth=np.zeros_like(frame.depth))], 0.02, 5.0)
+    empty = fuse_depth(open3d(), [frame._replace(depth=np.zeros_like(frame.depth))], 0.02, 5.0)
     assert [len(part) for part in (empty.vertices, empty.triangles, empty.colors)] == [0, 0, 0]
 
 
@@ -76,11 +76,11 @@ def test_cleaning_removes_what_floats_closes_holes_and_keeps_to_the_number_of_tr
         np.concatenate([holed, len(ball.vertices) + np.arange(3)[None]]).astype(np.int32),
         np.concatenate([ball.colors, np.zeros((3, 3), np.uint8)]),
     )
-    whole = cleaned(mesh, 10**6, 0.2, 100, 0.02)
+    whole = clean_mesh(mesh, 10**6, 0.2, 100, 0.02)
     assert np.linalg.norm(whole.vertices, axis=1).max() < 0.6
     edges = np.sort(whole.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
-    fewer = cleaned(mesh, 500, 0.2, 100, 0.02)
+    fewer = clean_mesh(mesh, 500, 0.2, 100, 0.02)
     assert len(fewer.triangles) <= 500
     assert np.abs(np.linalg.norm(fewer.vertices, axis=1) - 0.5).max() < 0.04
     assert len(fewer.colors) == len(fewer.vertices)
@@ -90,24 +90,24 @@ def test_clustering_leaves_what_is_wanted_and_keeps_the_surface(monkeypatch):
     pytest.importorskip("pymeshlab", reason="the extra mesh is not installed")
     # nothing is left to the collapse but the excess
     monkeypatch.setattr("chebsplat.formats.meshes.EASY", 1)
-    fine = fused(open3d(), of_a_ball(), 0.01, 5.0)
+    fine = fuse_depth(open3d(), of_a_ball(), 0.01, 5.0)
     for wanted in (len(fine.triangles) // 2, len(fine.triangles) // 8):
-        found = cleaned(fine, wanted, 0.2, 100, 0.01)
+        found = clean_mesh(fine, wanted, 0.2, 100, 0.01)
         assert 0.6 * wanted < len(found.triangles) <= wanted
         assert np.quantile(np.abs(np.linalg.norm(found.vertices, axis=1) - 0.5), 0.9) < 0.01
 
 
 def test_a_missing_pymeshlab_is_named_with_what_helps(ball, monkeypatch):
     monkeypatch.setitem(sys.modules, "pymeshlab", None)
-    with pytest.raises(ConfigError, match=r"chebsplat\[mesh\].*--raw"):
-        cleaned(ball, 100, 0.1, 10, 0.02)
+    with pytest.raises(ConfigError, match=r"the extra `mesh`: .*\[mesh\].*--raw"):
+        clean_mesh(ball, 100, 0.1, 10, 0.02)
 
 
 def test_pixels_at_a_step_of_depth_and_without_depth_are_left_out():
     depth = np.full((6, 8), 2.0, np.float32)
     depth[:, 4:] *= 1 + 2 * STEP
     depth[2, 1] = np.nan
-    found = without_edges(depth)
+    found = drop_edges(depth)
     assert (found[:, 3:5] == 0).all()
     assert found[2, 1] == 0
     assert (np.delete(found, (3, 4), axis=1) > 0).sum() == 6 * 6 - 1

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 from shared import gaussian_parameters
 
-import chebsplat.kernels.jit  # noqa: F401  # gsply runs on numba too: the threading layer is chosen first
+import chebsplat.kernels.jit  # noqa: F401  # chooses the threading layer before gsply's numba
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats import ply
 from chebsplat.formats.splats import READ, is_splat, read_splats, write_splats
@@ -65,7 +65,8 @@ def test_spz_of_gsply_is_turned_into_the_axes_of_a_ply(tmp_path, degree):
     p = given(degree)
     theirs = gsply.GSData(
         means=p["means"], scales=p["log_scales"], quats=p["quats"], opacities=p["logit_opacities"],
-        sh0=p["sh0"][:, 0], shN=p["shN"][:, : ply.REST[degree]], masks=None, mask_names=None, _base=None,
+        sh0=p["sh0"][:, 0], shN=p["shN"][:, : ply.REST[degree]], masks=None, mask_names=None,
+        _base=None,
     )  # fmt: skip
     gsply.write_spz(tmp_path / "a.spz", theirs)
     found, found_degree, labels = read_splats(tmp_path / "a.spz")

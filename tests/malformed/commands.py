@@ -87,7 +87,8 @@ STUDIES: list[tuple[str, str, str]] = [  # what is wrong, the text, what stderr 
 ]
 SEQUENCES = ["[scenes", "", "scenes = []", 'scenes = "toy"', "scenes = [1, 2]", 'scenes = ["toy", '
                                                                                 '""]',
-             'scenes = ["to\\ny"]', 'scenes = ["toy"]\nsteps = 5', "scenes = [" + '"toy",' * 2000 + "]"]  # fmt: skip
+             'scenes = ["to\\ny"]', 'scenes = ["toy"]\nsteps = 5',
+             "scenes = [" + '"toy",' * 2000 + "]"]  # fmt: skip
 NAMES: list[tuple[str, str, int]] = [  # a command's words, what it must name, its exit code
     ("run", "scene=", 2),
     ("run --scene ofice0", "office0", 2),
@@ -208,7 +209,8 @@ def documents() -> Iterator[Row]:
     for kind in ("config", "study", "sequence"):
         yield met(kind, "a pipe", no_file("a.toml", "pipe"), "a pipe", True)
     yield met("config", "a device", no_file("a.toml", "device"), "a device", True)
-    yield met("json config", "a terabyte", lambda folder: (put("a.json", "")(folder), swollen("a.json")(folder)),
+    yield met("json config", "a terabyte",
+              lambda folder: (put("a.json", "")(folder), swollen("a.json")(folder)),
               "are read", True)  # fmt: skip
 
 
@@ -217,7 +219,8 @@ def names() -> Iterator[Row]:
         yield words("command", line.split(), word, code=code)
     for word in ("a\nb", "\x1b[31mred", "toy\udcff"):
         yield words("command", ["run", "--scene", word], repr(word))
-    for command, word in ((["run", "--scene"], "scene="), (["run", "--sequence"], "sequence"), (["study"], "study"),
+    for command, word in ((["run", "--scene"], "scene="), (["run", "--sequence"], "sequence"),
+                          (["study"], "study"),
                           (["verify"], "''")):  # fmt: skip
         yield words("command", [*command, ""], word)
 

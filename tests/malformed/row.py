@@ -99,7 +99,8 @@ def run_alone(arguments: Arguments, folder: Path, seconds: float = SECONDS) -> A
     command = [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", *map(str, arguments)]
     peak = [0]
     with tempfile.TemporaryFile() as stderr:
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr,
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                                   stderr=stderr,
                                    cwd=folder, start_new_session=True)  # fmt: skip
         watch = threading.Thread(target=_watch, args=(process, peak), daemon=True)
         watch.start()

@@ -206,7 +206,8 @@ def companions() -> Iterator[Row]:
         ),
     ]
     yield from met(write_companions, cases)
-    heavy: list[Case] = [(f"{place}/b.png", "10,000 million pixels", declared_png(100_000, 100_000, 0), "too large")
+    heavy: list[Case] = [(f"{place}/b.png", "10,000 million pixels",
+                          declared_png(100_000, 100_000, 0), "too large")
                          for place in MODES]  # fmt: skip
     yield from met(write_companions, heavy, alone=True)
     black = all_of(*(picture(f"masks/{n}.png", mode="L") for n in "abc"))
@@ -214,8 +215,8 @@ def companions() -> Iterator[Row]:
     yield from met(write_companions, [
         ("masks/a.png", "all are black", black, "no pixel of any view counts"),
         ("images/a.png", "all are transparent", clear, "no pixel of any view counts"),
-        ("ids [7]", "no label has a name", put("labels.json", '{"3": "sofa"}'), "no label has a "
-                                                                                "name"),
+        ("ids [7]", "no label has a name", put("labels.json", '{"3": "sofa"}'),
+         "no label has a name"),
     ], 4)  # fmt: skip
 
 
@@ -311,10 +312,8 @@ def colmap() -> Iterator[Row]:
         "are absolute": b"/etc/x.png",
         "are no UTF-8": b"\xff",
     }
-    few: list[Case] = [("ingest.min_views", f"names that {what}", put(images, views((name,) * 3)), "absent on "
-                                                                                                   ""
-                                                                                                   ""
-                                                                                                   "disk")
+    few: list[Case] = [("ingest.min_views", f"names that {what}", put(images, views((name,) * 3)),
+                        "absent on disk")
                        for what, name in outside.items()]  # fmt: skip
     yield from met(write_model, few, 4)
     heavy: list[Case] = [
@@ -331,10 +330,11 @@ def colmap() -> Iterator[Row]:
                       (f"1 PINHOLE {'9' * 5000} 6 10 10 4 3", NO_MODEL)):  # fmt: skip
         as_text.append((f"{MODEL}/cameras.txt", row[:24], f"{row}\n", word))
     kept = "1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 1 b.png\n\n"
-    for row, word in (("3 nan 0 0 0 2 0 0 1 c.png", NO_POSE), ("3 1 0 0 0 2 0 0 1", "line 5 is "
-                                                                                    "neither"),
+    for row, word in (("3 nan 0 0 0 2 0 0 1 c.png", NO_POSE),
+                      ("3 1 0 0 0 2 0 0 1", "line 5 is neither"),
                       ("3 1 0 0 0 2 0 0 1 c.png\n4 5 -1 6 7 -1 8", "line 6 is neither"),
-                      ("3 1 0 0 0 2 0 0 1 c.png\n4 5 -1 6 7 -1 8 9 -1 4", "line 6 is neither")):  # fmt: skip
+                      ("3 1 0 0 0 2 0 0 1 c.png\n4 5 -1 6 7 -1 8 9 -1 4",
+                       "line 6 is neither")):  # fmt: skip
         as_text.append((f"{MODEL}/images.txt", row, f"{kept}{row}\n", word))
     as_text.append(
         (f"{MODEL}/points3D.txt", "half a track", "1 0 0 2 9 9 9 .5 1 0 2\n", "a point of 11 words")
@@ -342,16 +342,16 @@ def colmap() -> Iterator[Row]:
     as_text.append(
         (f"{MODEL}/cameras.txt", "half a pixel", "1 PINHOLE 8.5 6 10 10 4 3\n", "no whole number")
     )
-    as_text += [("scene.json", f"test_every = {value!r}", keys("scene.json", test_every=value), "test_every")
+    as_text += [("scene.json", f"test_every = {value!r}", keys("scene.json", test_every=value),
+                 "test_every")
                 for value in (True, 0, "8")]  # fmt: skip
-    as_text += [("scene.json", f"frames = {value!r}", keys("scene.json", test_every=8, frames=value), "frames")
+    as_text += [("scene.json", f"frames = {value!r}",
+                 keys("scene.json", test_every=8, frames=value), "frames")
                 for value in (3, [{"file": 3}])]  # fmt: skip
     as_text += [("scene.json", f"labels = {value!r}", keys("scene.json", labels=value), "label")
                 for value in ([], {"7": " "}, {"7": ["sofa"]})]  # fmt: skip
-    as_text += [("labels.json", f"an id of {key[:9]!r}", f'{{"{key}": "sofa"}}', "a label's id is not "
-                                                                                 ""
-                                                                                 ""
-                                                                                 "usable")
+    as_text += [("labels.json", f"an id of {key[:9]!r}", f'{{"{key}": "sofa"}}',
+                 "a label's id is not usable")
                 for key in ("-1", "65536", "9" * 5000)]  # fmt: skip
     yield from met(write_colmap, as_text)
 
@@ -424,12 +424,14 @@ def transforms() -> Iterator[Row]:
         "is not supported": {"k4": (0.1,), "camera_model": ("EQUIRECTANGULAR", {})},
     }
     cases += [(FILE, f"{key} = {json.dumps(value)[:20]}", keys(FILE, **{key: value}), word)
-              for word, given in numbers.items() for key, values in given.items() for value in values]  # fmt: skip
+              for word, given in numbers.items()
+              for key, values in given.items() for value in values]  # fmt: skip
     cases += [
         (FILE, f"camera_angle_x = {text}", by_angle(text), NO_NUMBERS)
         for text in ("0", "1e400", "3.2")
     ]
-    paths = {"climbs": "../../etc/hostname", "is absolute": "/etc/x.png", "climbs late": "images/../../x.png",
+    paths = {"climbs": "../../etc/hostname", "is absolute": "/etc/x.png",
+             "climbs late": "images/../../x.png",
              "climbs by backslashes": "..\\..\\x.png"}  # fmt: skip
     cases += [
         (FILE, f"a path that {what}", frame(file_path=path), ELSEWHERE)
@@ -627,8 +629,8 @@ def scannet() -> Iterator[Row]:
         ("nan", header() + coordinates(NAN), "not finite"),
     ]
     tables = [("nothing", "", IDS), ("a negative id", f"{HEAD}-1\twall\t1\n", IDS),
-              ("class 21", f"{HEAD}1\twall\t21\n", IDS), ("short rows", f"{HEAD}1\n", "no usable "
-                                                                                      "columns"),
+              ("class 21", f"{HEAD}1\twall\t21\n", IDS),
+              ("short rows", f"{HEAD}1\n", "no usable columns"),
               ("another column", "id\tnyu40id\n1\t1\n", "cocomapid"),
               ("an endless id", f"{HEAD}{'9' * 5000}\twall\t1\n", "no usable columns"),
               ("an open quote", f'{HEAD}1\t"{"a" * 200_000}', "is no table")]  # fmt: skip
@@ -645,9 +647,11 @@ def scannet() -> Iterator[Row]:
           for place in (pose, intrinsics, TABLE)),
     ]  # fmt: skip
     yield from met(write_sg, cases)
-    bombs = {"10^12 points": header(10**12) + coordinates(), "10^12 points as text": header(10**12, "ascii 1.0"),
+    bombs = {"10^12 points": header(10**12) + coordinates(),
+             "10^12 points as text": header(10**12, "ascii 1.0"),
              "a long header": header(more="comment a\n" * 200_000) + coordinates(),
-             "2,000 values a point": header(10**5, more="property double p\n" * 2000) + bytes(1 << 18)}  # fmt: skip
+             "2,000 values a point": header(10**5, more="property double p\n" * 2000)
+             + bytes(1 << 18)}  # fmt: skip
     heavy: list[Case] = [(POINTS, what, content, NO_PLY) for what, content in bombs.items()]
     heavy += [
         (POINTS, "a pipe", no_file(POINTS, "pipe"), "a pipe"),
@@ -665,9 +669,11 @@ def scannet() -> Iterator[Row]:
     cases.append((CONFIDENCE, "missing", remove(CONFIDENCE), "is missing"))
     cases.append((CONFIDENCE, "cut short", cut(CONFIDENCE, 40), COPY))
     for what, content in {
-        "no zip": b"confidence", "another name": npz(probability=npy(SURE)), "one row": npz(confidence=npy(SURE[0])),
+        "no zip": b"confidence", "another name": npz(probability=npy(SURE)),
+        "one row": npz(confidence=npy(SURE[0])),
         "words": npz(confidence=npy(np.full((6, 8), "a"))), "nan": npz(confidence=npy(SURE * NAN)),
-        "objects": npz(confidence=npy(np.zeros((6, 8)), descr="|O")), "no pixel": npz(confidence=npy(SURE[:0])),
+        "objects": npz(confidence=npy(np.zeros((6, 8)), descr="|O")),
+        "no pixel": npz(confidence=npy(SURE[:0])),
         "7": npz(confidence=npy(7 * SURE)),
     }.items():  # fmt: skip
         cases.append((CONFIDENCE, what, content, COPY))
@@ -695,8 +701,8 @@ def seven_scenes() -> Iterator[Row]:
         (color, "another size", picture(color, (16, 9)), "its camera 8x6"),
         (depth, "missing", remove(depth), "is missing"),
         (depth, "another size", picture(depth, (4, 4), "I;16"), "its photo 8x6"),
-        ("frame-000001", "two pictures", picture("frame-000001.color.jpg", form="JPEG"), "are both "
-                                                                                         "view"),
+        ("frame-000001", "two pictures", picture("frame-000001.color.jpg", form="JPEG"),
+         "are both view"),
     ])  # fmt: skip
 
 

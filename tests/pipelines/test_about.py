@@ -13,6 +13,7 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.work.scenes import ONE, names, read_toml
+from chebsplat.stages.runtime import progress
 from chebsplat.stages.runtime.config import known_keys
 
 
@@ -29,6 +30,13 @@ def test_settings_lists_every_setting_with_its_default_range_and_meaning():
     assert "mixed | region | classic | off" in asked("settings", "train").stdout
     wrong = asked("settings", "trian")
     assert (wrong.exit_code, "did you mean train" in wrong.stderr) == (2, True)
+
+
+@pytest.mark.parametrize(("flags", "level"), [([], "INFO"), (["-v"], "DEBUG")])
+def test_v_shows_details_of_this_process_and_of_its_jobs(monkeypatch, flags, level):
+    monkeypatch.setenv(progress.VERBOSE, "")
+    assert asked(*flags, "scenes").exit_code == 0
+    assert progress.log_level() == level
 
 
 def test_version_names_chebsplat_and_what_it_computes_with_and_imports_none_of_it():

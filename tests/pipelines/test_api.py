@@ -2,8 +2,14 @@
 say.
 """
 
+import os
+import pydoc
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+from shared import ROOT
 
 import chebsplat
 from chebsplat.errors import ChebsplatError, ConfigError, DataFailure
@@ -108,6 +114,37 @@ def test_what_cannot_be_is_said(scene):
         scene.query("wall")
     with pytest.raises(AttributeError):
         chebsplat.nothing  # noqa: B018
+
+
+def test_help_lists_the_public_names_with_a_line_each():
+    told = pydoc.plain(pydoc.render_doc(chebsplat))
+    first = told.partition("PACKAGE CONTENTS")[0]
+    for name in chebsplat.__all__:
+        assert any(line.split()[:1] == [name] and "." in line for line in first.splitlines())
+        assert f"    {name}(" in told
+
+
+USERS = """
+import chebsplat
+
+scene = chebsplat.train("photos/", train={"steps": 9}, cores=2)
+reveal_type(scene)
+reveal_type(scene.render(scene.cameras[0]).color.shape)
+chebsplat.load("toy", 3)
+"""
+
+
+@pytest.mark.slow
+def test_a_users_script_is_checked_against_the_types(tmp_path):
+    (tmp_path / "script.py").write_text(USERS)
+    options = ["--strict", "--follow-imports=silent", "--ignore-missing-imports"]
+    command = [sys.executable, "-m", "mypy", *options, "script.py"]
+    environment = os.environ | {"MYPYPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    lines = done.stdout.splitlines()
+    assert "chebsplat.stages.tools.scene.OpenedScene" in lines[0], done.stdout
+    assert "tuple" in lines[1] and 'Too many arguments for "load"' in lines[2]
+    assert len(lines) == 4, done.stdout  # and their number
 
 
 def test_settings_are_values_and_name_the_links_as_the_command_does():

@@ -14,7 +14,7 @@ from chebsplat.pipelines.planning import sequences
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.running import cluster, job
 from chebsplat.pipelines.running import processes as children
-from chebsplat.pipelines.running.run import device_of, entry, wanted_steps, write_plan
+from chebsplat.pipelines.running.run import device_of, entry, needed_steps, write_plan
 from chebsplat.pipelines.studies.study import checked_study, expand, outstanding
 from chebsplat.pipelines.work import leases, store
 from chebsplat.stages.registry import STAGES
@@ -49,16 +49,16 @@ def test_every_stage_says_what_it_needs():
 
 
 def test_on_one_machine_a_step_is_a_job():
-    entries = entries_of(wanted_steps(Planner().plan("office0"), None))
+    entries = entries_of(needed_steps(Planner().plan("office0"), None))
     assert jobs(entries, "local") == sorted([item["stage"]] for item in entries)
 
 
 def test_steps_of_seconds_go_with_what_they_follow():
     toy = [["ingest", "sfm", "teacher", "agree"], ["train", "lift", "refine", "export", "evaluate"]]
     assert [
-        some[:5] for some in jobs(entries_of(wanted_steps(Planner().plan("toy"), None)))
+        some[:5] for some in jobs(entries_of(needed_steps(Planner().plan("toy"), None)))
     ] == sorted(toy)
-    office = jobs(entries_of(wanted_steps(Planner().plan("office0"), None)))
+    office = jobs(entries_of(needed_steps(Planner().plan("office0"), None)))
     assert ["ingest", "sfm", "describe", "encode", "onnx"] in office and ["train"] in office
     assert ["teacher", "agree", "learn"] in office
     assert ["lift", "refine", "export", "evaluate", "report"] in office
@@ -67,7 +67,7 @@ def test_steps_of_seconds_go_with_what_they_follow():
 @pytest.mark.parametrize("ablation", ["paper", ""])
 def test_no_job_of_a_sequence_or_of_what_is_half_done_waits_for_itself(tmp_path, ablation):
     (tmp_path / "mine.toml").write_text('scenes = ["toy", "office0", "toy", "office0"]')
-    plans = sequences.chain(
+    plans = sequences.plan_sequence(
         Planner(), str(tmp_path / "mine.toml"), "knowledge.start=rooms", ablation
     )
     steps = {step.key: step for plan in plans for step in plan.steps}
@@ -84,9 +84,9 @@ def test_a_study_of_short_trainings_is_one_job_a_run():
     assert len(found) == 1 + 4
 
 
-def test_jobs_ask_for_the_most_that_a_step_needs_for_the_time_of_all_and_for_a_gpu_where_one_computes():
+def test_jobs_ask_for_the_most_memory_of_a_step_the_time_of_all_and_a_gpu_where_one_computes():
     made = cluster.jobs_of(
-        entries_of(wanted_steps(Planner(device="cuda").plan("office0"), None), "cuda"), "slurm"
+        entries_of(needed_steps(Planner(device="cuda").plan("office0"), None), "cuda"), "slurm"
     )
     train = next(one for name, one in made.items() if name.startswith("train"))
     assert train["gpus"] == 1 and train["mem_mb"] == cluster.NEEDS["train"].mem_mb
@@ -133,10 +133,10 @@ def test_a_profile_that_cannot_be_used_is_named(tmp_path, text, message):
 
 
 def test_without_the_plugin_or_slurm_a_run_there_says_what_is_missing(monkeypatch):
-    monkeypatch.setattr(cluster, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"plugin for slurm is not installed.*\[slurm\]"):
+    monkeypatch.setitem(sys.modules, cluster.PLUGIN, None)
+    with pytest.raises(ConfigError, match=r"on=slurm needs the extra `slurm`: .*\[slurm\]"):
         cluster.checked("slurm")
-    monkeypatch.setattr(cluster, "find_spec", lambda name: name)
+    monkeypatch.setattr(cluster, "require", lambda *_: None)
     monkeypatch.setattr(cluster.shutil, "which", lambda name: None)
     with pytest.raises(ConfigError, match="no sbatch on the PATH"):
         cluster.checked("slurm")
@@ -147,7 +147,7 @@ def test_a_job_on_a_node_stops_when_its_run_lets_go(monkeypatch, tmp_path):
     plan, told = store.work() / ".plans/abc-1/plan.json", threading.Event()
     monkeypatch.setattr(leases, "EVERY", 0.05)
     monkeypatch.setattr(cluster, "end_itself", told.set)
-    with leases.held(store.run_lease(plan.parent)):
+    with leases.hold(store.run_lease(plan.parent)):
         cluster.watch_run(plan)
         assert not told.wait(0.3)
     assert told.wait(5)
@@ -168,7 +168,7 @@ def test_steps_of_a_job_have_processes_of_their_own_and_end_with_the_first_that_
 ):
     told = tmp_path / "told"
     calls = [[f"step{k}", one, str(told)] for k, one in enumerate(codes)]
-    assert children.in_turn(_step, calls) == code
+    assert children.run_in_turn(_step, calls) == code
     lines = [line.split() for line in told.read_text().splitlines()]
     assert [name for name, _, _ in lines] == ["step0", "step1"][: 1 if codes[0] != "0" else 2]
     assert len({process for _, process, _ in lines} | {str(os.getpid())}) == len(lines) + 1

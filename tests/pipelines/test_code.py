@@ -8,6 +8,7 @@ import sys
 import pytest
 from tiny_teachers import color_teacher
 
+from chebsplat.errors import ConfigError
 from chebsplat.pipelines.planning.code import OPTIONAL, PACKAGE, Code
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.stages.registry import STAGES
@@ -55,6 +56,7 @@ def extras(tmp_path, monkeypatch):
         for name in EXTRAS:
             folder = tmp_path / f"extras/{name}-1.dist-info"
             folder.mkdir(parents=True, exist_ok=True)
+            (tmp_path / f"extras/{name}.py").touch()
             (folder / "METADATA").write_text(
                 f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n"
             )
@@ -83,11 +85,13 @@ def test_words_that_a_teacher_s_own_table_knows_need_no_text_encoder(extras, tmp
     known, unknown = (
         f"teacher.kind=auto,teacher.labels={tmp_path / name}.txt" for name in ("known", "unknown")
     )
-    before, asking = keys("toy", known), keys("toy", unknown)
+    before = keys("toy", known)
+    with pytest.raises(ConfigError, match=r"unknown\.txt asks for words .* the extra `text`: "):
+        keys("toy", unknown)
     extras()
     assert keys("toy", known) == before
     with_text = keys("toy", unknown)
-    changed = [stage for stage in with_text if with_text[stage] != asking[stage]]
+    changed = [stage for stage in with_text if with_text[stage] != before[stage]]
     assert changed[0] == "teacher" and {"ingest", "sfm", "channels", "describe"}.isdisjoint(changed)
     extras("2.0")
     assert keys("toy", unknown)["teacher"] != with_text["teacher"]

@@ -125,7 +125,7 @@ def test_rm_removes_a_scene_and_what_only_it_names(work):
     assert not (work / "toy").exists()
     assert all(map(store.is_fresh, other.targets.values()))
     assert not store.is_fresh(one.targets["train"])
-    assert store.unnamed() == []
+    assert store.list_unreferenced() == []
 
 
 def test_rm_keeps_what_is_not_ours(tmp_path, work):

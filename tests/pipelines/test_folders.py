@@ -5,9 +5,11 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+from click.testing import CliRunner
 from shared import finish, photo_folder
 
 from chebsplat.errors import ConfigError
+from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.work import finished, folders, inventory, store
 
@@ -37,8 +39,20 @@ def test_folders_of_one_name_do_not_share_their_links_and_are_found_again(tmp_pa
     assert [finished.scene_folder(f"{folder}").name for folder in places] == titles
     listed = {title: source for title, source, *_ in inventory.scenes()}
     assert listed == {title: str(folder) for title, folder in zip(titles, places, strict=True)}
-    assert store.unnamed() == []  # nothing was taken over
+    assert store.list_unreferenced() == []  # nothing was taken over
     assert Planner().plan(f"{places[0]}/", "train.steps=5").title == f"{titles[0]}@train.steps=5"
+
+
+def test_a_folder_beside_wins_over_a_scene_of_ours_of_its_name_and_is_named(tmp_path, monkeypatch):
+    photo_folder(tmp_path / "kitchen")
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(main, ["plan", "--scene", "kitchen"])
+    assert done.exit_code == 0, done.stderr
+    assert done.stdout.startswith(f"kitchen-{digits(tmp_path / 'kitchen')}: ")
+    assert "kitchen is taken to be the folder here" in done.stderr
+    monkeypatch.chdir(tmp_path / "kitchen")
+    done = CliRunner().invoke(main, ["plan", "--scene", "toy"])
+    assert done.stdout.startswith("toy: ") and "folder here" not in done.stderr
 
 
 def test_a_name_of_ours_is_never_a_folder_s(tmp_path):

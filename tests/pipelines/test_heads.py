@@ -17,7 +17,7 @@ from chebsplat.formats.knowledge import SHIPPED
 from chebsplat.formats.lesson import SCHEMA, Lesson, write_lesson
 from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines.planning.plan import Planner
-from chebsplat.pipelines.planning.sequences import chain, relearning
+from chebsplat.pipelines.planning.sequences import plan_relearning, plan_sequence
 from chebsplat.pipelines.work import heads, store
 from chebsplat.stages.registry import STAGES
 
@@ -149,7 +149,8 @@ def test_damaged_pins_and_records_are_refused_by_name():
     a = add("a", "photos a")
     recalled("office0")
     for path, remedy in ((store.work() / "office0" / heads.PIN, "pins the scene anew"),
-                         (heads.folder("rooms") / f"{a}.json", "adds? its lesson|adds it again")):  # fmt: skip
+                         (heads.folder("rooms") / f"{a}.json",
+                          "adds? its lesson|adds it again")):  # fmt: skip
         good = path.read_text()
         for bad in ("{", "[]", '{"a": 1}'):
             path.write_text(bad)
@@ -168,7 +169,7 @@ def test_scenes_of_a_sequence_start_from_the_lessons_of_those_before(tmp_path):
         "rooms", made("office0 before"), Planner().plan("office0").lesson.capture, START, "office0"
     )
     (tmp_path / "mine.toml").write_text('scenes = ["office0", "office1", "office0", "room0"]')
-    plans = chain(Planner(running=True), str(tmp_path / "mine.toml"))
+    plans = plan_sequence(Planner(running=True), str(tmp_path / "mine.toml"))
     found = [
         {role for step in plan.steps if step.stage == "recall" for role in step.inputs}
         for plan in plans
@@ -199,10 +200,10 @@ def test_a_set_is_learned_again_by_another_encoder_from_what_the_store_holds(cap
         write_lesson(tmp, Lesson((np.eye(3), np.ones((3, 2)), 1.0), {"scene": "a"}))
     heads.add("rooms", path, "photos a", key_of("older"), "a")
     add("b", "photos b")  # by the encoder that ships: stays
-    (plan,) = relearning(Planner(running=True), "rooms")
+    (plan,) = plan_relearning(Planner(running=True), "rooms")
     assert [step.stage for step in plan.steps] == ["encode", "learn"]
     assert plan.steps[1].inputs["encoding"] == plan.steps[0].path
     assert (plan.lesson.capture, plan.lesson.start) == ("photos a", START)
     store.remove(store.artifact_path("describe", key_of("describe")))
-    assert relearning(Planner(running=True), "rooms") == []
+    assert plan_relearning(Planner(running=True), "rooms") == []
     assert "a: its artifacts are gone" in capsys.readouterr().err

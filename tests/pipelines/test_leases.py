@@ -14,7 +14,7 @@ ENDLESS = """
 import sys, time
 from pathlib import Path
 from chebsplat.pipelines.work import leases
-with leases.held(Path(sys.argv[1])):
+with leases.hold(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)
 """
@@ -34,7 +34,7 @@ def test_who_is_killed_is_followed_at_once_and_nobody_before(tmp_path):
         holder.kill()
         holder.communicate()
 
-    with leases.held(path, kill):
+    with leases.hold(path, kill):
         assert told == [(socket.gethostname(), socket.gethostname())]
         assert leases.holder(path) == socket.gethostname()
     assert leases.holder(path) is None
@@ -68,6 +68,6 @@ def test_who_is_silent_elsewhere_is_followed_after_a_while(tmp_path, monkeypatch
     path, told, began = elsewhere(tmp_path / "lease"), [], time.monotonic()
     if machine is None:
         path.write_text("")
-    with leases.held(path, told.append):
+    with leases.hold(path, told.append):
         assert told == [machine or "this machine"]
         assert time.monotonic() - began >= leases.EXPIRES

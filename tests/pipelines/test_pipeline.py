@@ -22,7 +22,7 @@ from chebsplat.formats.teacher_model import EMBEDDED
 from chebsplat.pipelines.planning.code import PACKAGE
 from chebsplat.pipelines.planning.plan import Planner, suffix
 from chebsplat.pipelines.planning.raw import content_hash, hashes
-from chebsplat.pipelines.running.run import failures, wanted_steps
+from chebsplat.pipelines.running.run import failures, needed_steps
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import CONFIGS, names, read_toml
 from chebsplat.stages.registry import OF_KNOWLEDGE, STAGES
@@ -246,7 +246,7 @@ def test_a_training_waits_for_the_agreement_of_views_and_reads_nothing_of_it():
     assert steps["train"].after == [steps["agree"].path]
     assert steps["agree"].path not in steps["train"].inputs.values()
     plan = Planner().plan("toy")
-    assert "agree" in [step.stage for step in wanted_steps(plan, "train")]
+    assert "agree" in [step.stage for step in needed_steps(plan, "train")]
     assert Planner().plan("toy", "teacher.kind=none").targets.keys() & {"agree"} == set()
 
 
@@ -329,6 +329,14 @@ def test_lifted_features_reach_the_export_and_trained_ones_do_not_wait_for_them(
     assert "features" in by_stage["train"]
 
 
+def test_a_finished_scene_of_colours_is_named_later_without_training_it_again():
+    without = ("teacher.kind=none", "train.semantics=false", "train.features=lifted")
+    plans = [{s.stage: s.key for s in Planner().plan("toy", of).steps} for of in (*without, "")]
+    assert len({plan["train"] for plan in plans[:3]}) == 1
+    assert plans[3]["train"] != plans[0]["train"]
+    assert {"lift", "refine"} <= plans[2].keys() and "lift" not in plans[0]
+
+
 @pytest.mark.parametrize("kind", ["scenes", "qualities", "ablations", "sequences"])
 def test_every_config_of_ours_can_be_planned(kind, tmp_path, monkeypatch):
     monkeypatch.setenv("CHEBSPLAT_TEST_DATA", str(tmp_path))
@@ -364,11 +372,11 @@ def test_links_name_artifacts_and_clean_stale_finds_what_nothing_names(work):
     assert (work / "toy/train").resolve() == plan.targets["train"]
     leftover = plan.targets["train"].with_name(".tmp-abc-999999999")
     leftover.mkdir()
-    found = {path for path, _ in store.unnamed()}
+    found = {path for path, _ in store.list_unreferenced()}
     assert found == {leftover, *(other.targets[s] for s in AFTER_TRAIN)}
     for path in found:
         store.remove(path)
-    assert store.unnamed() == []
+    assert store.list_unreferenced() == []
     assert all(store.is_fresh(path) for path in plan.targets.values())
 
 
@@ -400,9 +408,13 @@ def test_clean_stale_spares_what_a_running_plan_makes_and_reads(work):
     scratch.mkdir()
     os.utime(scratch, (1, 1))
     folder = running_plan(work, plan, os.getpid())
-    assert store.unnamed() == []
+    assert store.list_unreferenced() == []
     folder.rename(dead := folder.with_name("abc-999999999"))
-    assert {path for path, _ in store.unnamed()} == {dead, scratch, *plan.targets.values()}
+    assert {path for path, _ in store.list_unreferenced()} == {
+        dead,
+        scratch,
+        *plan.targets.values(),
+    }
 
 
 def test_a_failed_run_tells_a_stage_that_failed_from_one_that_was_killed(tmp_path, capfd):

@@ -22,7 +22,7 @@ from benchmarks.stability.training import tiny_trainer
 from chebsplat.kernels import jit
 from chebsplat.pipelines.running import precompile
 if __name__ == "__main__":
-    with precompile.rehearsed(2, True):
+    with precompile.precompile(2, True):
         made = tiny_trainer(steps=30, weight_depth=1.0, depth_every=2)
         for _ in made.steps():
             pass
@@ -56,16 +56,16 @@ def test_nothing_is_rehearsed_twice_nor_on_one_thread_nor_where_nothing_is_kept(
     monkeypatch.setattr(precompile, "NEEDED", (rasterizer, *precompile.NEEDED[1:]))
     monkeypatch.setattr(precompile, "rasterizer", rasterizer)
     monkeypatch.setattr(jit, "FOLDER", tmp_path)
-    with precompile.rehearsed(1, True):
+    with precompile.precompile(1, True):
         pass
     kept(tmp_path, *precompile.NEEDED)
-    with precompile.rehearsed(2, False):
+    with precompile.precompile(2, False):
         pass
     kept(tmp_path, *precompile.SEMANTIC)
-    with precompile.rehearsed(2, True):
+    with precompile.precompile(2, True):
         pass
     monkeypatch.setattr(jit, "FOLDER", None)
-    with precompile.rehearsed(2, True):
+    with precompile.precompile(2, True):
         pass
 
 
@@ -76,7 +76,7 @@ def test_what_another_process_rehearses_is_waited_for(tmp_path, monkeypatch):
     monkeypatch.setattr(jit, "FOLDER", tmp_path)
     with open(tmp_path / "rehearsed-rasterizer.lock", "w") as held, ThreadPoolExecutor(1) as pool:
         fcntl.flock(held, fcntl.LOCK_EX)
-        waiting = pool.submit(precompile.once, rasterizer)
+        waiting = pool.submit(precompile.compile_once, rasterizer)
         with pytest.raises(TimeoutError):
             waiting.result(0.2)
         kept(tmp_path, rasterizer)
@@ -91,16 +91,18 @@ from chebsplat.pipelines.running import precompile
 if __name__ == "__main__":
     lock = jit.FOLDER / "rehearsed-pause.lock"
     try:
-        with precompile.beside([signal.pause]) as process:
+        with precompile.compiler_process([signal.pause]) as process:
             until = time.monotonic() + 60
-            while not (lock.exists() and precompile.is_locked(signal.pause)) and time.monotonic() < until:
+            while time.monotonic() < until and not (
+                lock.exists() and precompile.is_locked(signal.pause)
+            ):
                 time.sleep(0.05)
             print(lock, process.is_alive(), flush=True)
             if sys.argv[1] == "killed":
                 os.kill(os.getpid(), signal.SIGKILL)
             raise KeyboardInterrupt
     except KeyboardInterrupt:
-        print(process.is_alive(), precompile.is_kept(signal.pause))
+        print(process.is_alive(), precompile.is_compiled(signal.pause))
 """
 
 

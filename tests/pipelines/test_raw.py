@@ -101,7 +101,8 @@ def test_of_photos_that_change_nothing_is_published_under_the_key_of_the_old(pho
 @pytest.mark.parametrize(
     ("stage", "file"),
     [
-        ("channels", "model"), ("channels", "reference"), ("teacher", "model"), ("teacher", "labels"),
+        ("channels", "model"), ("channels", "reference"), ("teacher", "model"),
+        ("teacher", "labels"),
         ("evaluate", "weights"),
     ],
 )  # fmt: skip

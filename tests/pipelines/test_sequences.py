@@ -7,8 +7,8 @@ from shared import ROOT
 
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines.planning.plan import Planner, overrides
-from chebsplat.pipelines.planning.sequences import chain, scenes_of
-from chebsplat.pipelines.running.run import wanted_steps
+from chebsplat.pipelines.planning.sequences import plan_sequence, scenes_of
+from chebsplat.pipelines.running.run import needed_steps
 
 BEFORE_TRAIN = {"ingest", "sfm", "teacher", "agree"}
 LABELS = "teacher.kind=labels"
@@ -38,7 +38,7 @@ def sequence(tmp_path):
 def keys(path):
     """By scene: its steps' keys by stage."""
     planner = Planner()
-    found = chain(planner, path, LABELS, "paper")
+    found = plan_sequence(planner, path, LABELS, "paper")
     planner.save()
     return [
         (scene, {step.stage: step.key for step in plan.steps})
@@ -72,7 +72,7 @@ def test_a_change_of_order_makes_exactly_what_depends_on_it_stale(sequence, orde
 
 
 def test_scene_k_reads_the_training_of_scene_k_minus_one_and_the_first_none(sequence):
-    found = chain(Planner(), sequence(*ORDER), LABELS, "paper")
+    found = plan_sequence(Planner(), sequence(*ORDER), LABELS, "paper")
     for place, plan in enumerate(found):
         read = {
             step.stage: step.inputs["earlier"] for step in plan.steps if "earlier" in step.inputs
@@ -82,13 +82,13 @@ def test_scene_k_reads_the_training_of_scene_k_minus_one_and_the_first_none(sequ
         f"mine-1-toy@paper+{LABELS}",
         f"mine-2-office0@paper+{LABELS}",
     ]
-    stages = [step.stage for step in wanted_steps(found[2], "train", found)]
+    stages = [step.stage for step in needed_steps(found[2], "train", found)]
     assert (stages.count("train"), stages.count("evaluate")) == (3, 0)
 
 
 def test_the_first_scene_of_a_sequence_is_the_scene_alone(sequence):
     (first, _), alone = (
-        chain(Planner(), sequence("toy", "office0"), "", "paper"),
+        plan_sequence(Planner(), sequence("toy", "office0"), "", "paper"),
         Planner().plan("toy", "", "paper"),
     )
     assert first.targets == alone.targets

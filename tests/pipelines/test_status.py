@@ -126,9 +126,9 @@ def test_a_run_under_way_on_another_machine_keeps_what_it_makes_from_clean_stale
         elsewhere = file.parent.with_name(file.parent.name.rpartition("-")[0] + "-999999999")
         os.rename(file.parent, elsewhere)
         os.rename(store.run_lease(file.parent), store.run_lease(elsewhere))
-        assert store.unnamed() == []
+        assert store.list_unreferenced() == []
         os.rename(store.run_lease(elsewhere), store.run_lease(file.parent))
-        assert len(store.unnamed()) == len(plan.steps) + 1
+        assert len(store.list_unreferenced()) == len(plan.steps) + 1
     assert not store.holder(store.run_lease(file.parent))
 
 

@@ -62,7 +62,9 @@ def test_a_damaged_artifact_keeps_what_it_was_made_of_from_clean_stale():
     ) as tmp:
         (tmp / "data.bin").write_bytes(bytes(100))
     (path / "data.bin").unlink()
-    assert {path, plan.targets["ingest"]}.isdisjoint(found for found, _ in store.unnamed())
+    assert {path, plan.targets["ingest"]}.isdisjoint(
+        found for found, _ in store.list_unreferenced()
+    )
 
 
 def test_links_that_lead_in_a_circle_or_out_of_the_store_are_removed_alone(work, tmp_path):
@@ -74,10 +76,10 @@ def test_links_that_lead_in_a_circle_or_out_of_the_store_are_removed_alone(work,
     circle, elsewhere = work / "store/sfm" / key_of(1), work / "store/sfm" / key_of(2)
     circle.symlink_to(circle.name)
     elsewhere.symlink_to(tmp_path / "mine")
-    assert {path for path, _ in store.unnamed()} == {circle, elsewhere}
-    for path, _ in store.unnamed():
+    assert {path for path, _ in store.list_unreferenced()} == {circle, elsewhere}
+    for path, _ in store.list_unreferenced():
         store.remove(path)
-    assert store.unnamed() == []
+    assert store.list_unreferenced() == []
     assert artifact.verify(tmp_path / "mine")
 
 
@@ -100,6 +102,6 @@ def test_a_folder_s_manifest_cannot_say_where_its_copy_goes(work, tmp_path, key)
     file.write_text(json.dumps(json.loads(file.read_text()) | {"key": key}))
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError, match="damaged: key"):
-        store.taken_in(folder, "teach", "chebsplat.knowledge/2", running=True)
+        store.import_artifact(folder, "teach", "chebsplat.knowledge/2", running=True)
     assert sorted(tmp_path.rglob("*")) == before
     assert not os.path.lexists("/tmp/elsewhere")

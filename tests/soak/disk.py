@@ -107,7 +107,8 @@ def disks(folder: Path, count: int, seed: int = 0) -> list[Full]:
         row = rows[-1]
         print(f"disk: {row.free:,} of {row.wanted:,} bytes free: exit code {row.code} after "
               f"{row.finished} artifacts, "
-              f"then {row.again}{'; ' + row.fault if row.fault else ''}", file=sys.stderr, flush=True)  # fmt: skip
+              f"then {row.again}{'; ' + row.fault if row.fault else ''}", file=sys.stderr,
+              flush=True)  # fmt: skip
     return rows
 
 

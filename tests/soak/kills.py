@@ -129,7 +129,8 @@ def lane(
             hit.append(blow)
             print(f"kills: {blow.how} after {blow.delay:.1f} s, gone in {blow.seconds:.1f} s, "
                   f"{len(waiting)} to come"
-                  f"{'; ' + blow.fault if blow.fault else ''}", file=sys.stderr, flush=True)  # fmt: skip
+                  f"{'; ' + blow.fault if blow.fault else ''}", file=sys.stderr,
+                  flush=True)  # fmt: skip
         run = Run(work)
         fault = (
             f"exit code {run.finish()}: {run.stderr[-300:]}"

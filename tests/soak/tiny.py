@@ -18,8 +18,10 @@ from chebsplat.errors import InputError
 from chebsplat.formats import artifact
 
 ROOT = Path(__file__).parents[2]
-SET = ("train.steps=12,train.n_densify=1,sfm.max_points=200,evaluate.timing_repeats=0,knowledge.start=none,"
-       "train.seed={seed}")  # fmt: skip
+SET = (
+    "train.steps=12,train.n_densify=1,sfm.max_points=200,evaluate.timing_repeats=0,"
+    "knowledge.start=none,train.seed={seed}"
+)
 MARKER = "CHEBSPLAT_SOAK"  # in the environment of a run and of all that it starts
 LOGS = ("log.jsonl", "trace.csv")  # hold seconds
 
@@ -45,7 +47,8 @@ class Run:
             os.environ | {"CHEBSPLAT_WORK": str(self.work), MARKER: self.mark} | self.environment
         )
         with self.words.open("wb") as stderr:
-            self.process = subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True,
+            self.process = subprocess.Popen(command, cwd=ROOT, env=environment,
+                                            start_new_session=True,
                                             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                                             stderr=stderr)  # fmt: skip
 
@@ -133,6 +136,9 @@ def contents(work: Path) -> dict[str, str]:
     found = {}
     for path in artifacts(work):
         manifest = artifact.verify(path)
-        found |= {f"{path.parent.name}/{path.name}/{name}": entry["sha256"] for name, entry in manifest.files.items()
-                  if name not in LOGS}  # fmt: skip
+        found |= {
+            f"{path.parent.name}/{path.name}/{name}": entry["sha256"]
+            for name, entry in manifest.files.items()
+            if name not in LOGS
+        }
     return found

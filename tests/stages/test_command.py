@@ -37,6 +37,14 @@ def test_artifact_is_published_and_its_path_printed(tmp_path):
     assert set(manifest.config) == {"scene", "source", "ingest"}
 
 
+@pytest.mark.parametrize(("verbose", "lines"), [("", 0), ("1", 1)])
+def test_what_a_scene_leaves_out_is_on_the_console_only_with_v(
+    tmp_path, monkeypatch, verbose, lines
+):
+    monkeypatch.setenv("CHEBSPLAT_VERBOSE", verbose)
+    assert invoke(good, "--out", tmp_path / "x").stderr.count("left out: depth") == lines
+
+
 def test_called_from_python_a_stage_prints_nothing_and_raises_typed_errors(tmp_path, capsys):
     publish("ingest", good, tmp_path / "x", {}, planned=Planned(KEY))
     assert artifact.verify(tmp_path / "x", "chebsplat.capture/2").key == KEY

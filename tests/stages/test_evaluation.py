@@ -20,7 +20,7 @@ from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.work import summary
 from chebsplat.render import SceneRenderer, frame_parts
 from chebsplat.stages.evaluate import camera
-from chebsplat.stages.measuring.image_quality import enlarged, image_figures, perceptual
+from chebsplat.stages.measuring.image_quality import enlarged, image_figures, load_lpips
 from chebsplat.stages.report import summary_rows
 from chebsplat.stages.sources import generated
 from tests.stages.test_stages import changed, inputs_of
@@ -95,7 +95,7 @@ def test_weights_of_lpips_are_read_from_both_kinds_of_file_and_wrong_ones_are_na
     a, b, _ = pictures()
     save_file(weights, tmp_path / "vgg.safetensors")
     torch.save(weights, tmp_path / "vgg.pth")
-    found = [perceptual(tmp_path / name).distance(a, b) for name in ("vgg.safetensors", "vgg.pth")]
+    found = [load_lpips(tmp_path / name).distance(a, b) for name in ("vgg.safetensors", "vgg.pth")]
     assert found[0] == found[1] == Lpips(weights).distance(a, b)
     damaged = {
         "no tensor lin3": {name: t for name, t in weights.items() if not name.startswith("lin3")},
@@ -107,15 +107,15 @@ def test_weights_of_lpips_are_read_from_both_kinds_of_file_and_wrong_ones_are_na
     for message, state in damaged.items():
         torch.save(state, tmp_path / "bad.pth")
         with pytest.raises(InputError, match=rf"bad\.pth holds no weights of LPIPS \({message}"):
-            perceptual(tmp_path / "bad.pth")
+            load_lpips(tmp_path / "bad.pth")
     (tmp_path / "bad.pth").write_bytes(b"no pickle")
     (tmp_path / "bad.safetensors").write_bytes(b"no header")
     torch.save(torch.nn.Linear(1, 1), tmp_path / "module.pth")
     for name in ("bad.pth", "bad.safetensors", "module.pth"):
         with pytest.raises(InputError, match=f"{name} holds no weights"):
-            perceptual(tmp_path / name)
+            load_lpips(tmp_path / name)
     with pytest.raises(InputError, match=r"evaluate\.lpips_weights"):
-        perceptual(tmp_path / "nowhere.pth")
+        load_lpips(tmp_path / "nowhere.pth")
 
 
 def test_what_is_masked_counts_in_no_image_figure_and_no_lpips_is_none(weights):
@@ -146,7 +146,8 @@ def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_undistorted_pho
     assert "as_taken" not in found["image"]  # its capture holds none
     timed = {"evaluation": "A", "gaussians": "B"}
     rows = [
-        summary_rows(figures, None, {"milliseconds": {}}, timed)[1][0] for figures in (whole, found)
+        summary_rows(figures, None, {"milliseconds": {}}, timed)[0].name
+        for figures in (whole, found)
     ]
     assert "undistorted" not in rows[0] and "of undistorted photos" in rows[1]
 
@@ -204,7 +205,8 @@ def test_a_finer_view_is_blurred_as_what_was_trained_on(toy):
 def test_views_of_capture_and_teacher_in_another_order_change_no_figure(toy, tmp_path):
     rng = np.random.default_rng(0)
     capture, features = Capture.read(toy["ingest"]), Features.read(toy["teacher"])
-    for record, parts in ((capture, ("images", "depth", "labels", "Ks", "cam_from_world", "is_test")),
+    for record, parts in ((capture,
+                           ("images", "depth", "labels", "Ks", "cam_from_world", "is_test")),
                           (features, ("features", "pseudo_labels", "confidence"))):  # fmt: skip
         order = rng.permutation(len(record.names))
         for part in parts:
@@ -295,7 +297,8 @@ def test_a_scannet_scene_runs_from_its_folder_to_the_figures_of_scannet_open(tmp
     )
     folder = tmp_path / "scene0000_00"
     layouts.write_scannet_sg(folder, fields)
-    config = changed(source={"kind": "scannet", "path": str(folder)}, ingest={"protocol": "scannet-open"},
+    config = changed(source={"kind": "scannet", "path": str(folder)},
+                     ingest={"protocol": "scannet-open"},
                      scene={"name": "scene0000_00"})  # fmt: skip
     made = {}
     for stage in ("ingest", "sfm", "teacher", "describe", "train", "export", "evaluate", "report"):

@@ -86,7 +86,7 @@ def test_what_is_begun_anew_counts_no_process_before_it(tmp_path, caplog):
     watch, scratch = machine.Stopwatch(), tmp_path / "scratch"
     watch.keep(scratch)
     assert len(machine.Stopwatch().processes()) == 1
-    (scratch / machine.KEPT).write_text("{")
+    (scratch / machine.PROCESSES).write_text("{")
     watch.go_on(scratch)
     assert len(watch.processes()) == 1
     assert "seconds of what was done before are not counted" in caplog.text
@@ -106,10 +106,12 @@ def test_a_resumed_stage_has_the_seconds_of_all_its_processes(toy, tmp_path, mon
     )
     monkeypatch.setattr(saves, "SECONDS", 0.0)
     with monkeypatch.context() as patched:
-        stopped_after(patched, *{"train": (saves.Saves, "offer", 5), "teacher": (machine.Stopwatch, "keep", 2),
+        stopped_after(patched,
+                      *{"train": (saves.Saves, "offer", 5),
+                        "teacher": (machine.Stopwatch, "keep", 2),
                                  "teach": (machine.Stopwatch, "keep", 1)}[stage])  # fmt: skip
         assert run_stage(stage, out, inputs, config) == Stopped(15, "").exit_code
-    kept = tmp_path / f".part-{stage}" / machine.KEPT
+    kept = tmp_path / f".part-{stage}" / machine.PROCESSES
     kept.write_text(json.dumps([MACHINE]))
     assert run_stage(stage, out, inputs, config) == 0
     manifest = artifact.read_manifest(out)

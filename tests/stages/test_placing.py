@@ -194,7 +194,8 @@ def test_a_splat_trained_little_is_taken_with_a_warning_and_few_views_or_one_col
     with caplog.at_level(logging.WARNING, "chebsplat"):
         assert in_frame(tmp_path / "a.ply", few, capture, view_of(capture), None) is few
     assert "trained little" in caplog.text
-    three = Capture(*(values[:3] for values in (capture.names, capture.images, capture.Ks, capture.cam_from_world)),
+    three = Capture(*(values[:3] for values in (capture.names, capture.images, capture.Ks,
+                                                capture.cam_from_world)),
                     np.zeros(3, bool))  # fmt: skip
     far = ANY.of_gaussians(parameters)
     assert in_frame(tmp_path / "a.ply", far, three, view_of(three), None) is far
@@ -212,7 +213,8 @@ def test_lift_and_train_take_a_splat_of_nerfstudios_frame_as_if_it_lay_in_theirs
     features, psnr = [], []
     for name, given in (("ours", parameters), ("theirs", way.of_gaussians(parameters))):
         write_ply(tmp_path / f"{name}.ply", given, 3)
-        figures = lift_ply(tmp_path / f"{name}.ply", up_to_teacher / "ingest", up_to_teacher / "sfm",
+        figures = lift_ply(tmp_path / f"{name}.ply", up_to_teacher / "ingest",
+                           up_to_teacher / "sfm",
                            up_to_teacher / "teacher", None, tmp_path / name)  # fmt: skip
         assert figures["gaussians"] == len(parameters["means"])
         features.append(Lifted.read(tmp_path / name / "lift").features)

@@ -1,9 +1,14 @@
-"""Long work shows rate and ETA: a bar on a terminal, plain lines elsewhere, and the log always."""
+"""Long work shows rate and time left: a bar on a terminal, plain lines elsewhere, and the log
+always; nothing is silent for long.
+"""
 
 import json
 import logging
+import time
 
-from chebsplat.stages.runtime.progress import Progress
+import pytest
+
+from chebsplat.stages.runtime.progress import Progress, duration
 
 
 def work(progress, n=3):
@@ -12,12 +17,12 @@ def work(progress, n=3):
 
 
 def test_a_terminal_gets_one_line_that_is_rewritten(capsys):
-    work(Progress(show=True))
+    work(Progress(show=True, expected=300))
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "\r" in error
     assert "work 3/3  loss 2" in error
-    assert "ETA" in error
+    assert "about 5 min left" in error
 
 
 def test_elsewhere_lines_are_logged_now_and_then_and_at_the_end(caplog):
@@ -47,3 +52,50 @@ def test_a_ticker_shows_what_a_library_counts_and_nothing_beyond_its_total(capsy
         tick()
     error = capsys.readouterr().err
     assert "poses 3/3" in error and "4/3" not in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("show", [False, True])
+def test_work_that_counts_nothing_says_now_and_then_that_it_goes_on(caplog, show):
+    progress = Progress(show=show, every=0.2, expected=30)
+    with caplog.at_level(logging.INFO, "chebsplat"), progress.alive():
+        time.sleep(1.0)
+    lines = [record.getMessage() for record in caplog.records]
+    assert 2 <= len(lines) <= 5
+    assert lines[0] == "0 s so far  about 30 s left"
+    time.sleep(0.4)
+    assert len(caplog.records) == len(lines)  # nothing once it is over
+
+
+def test_a_bar_that_stands_still_shows_that_time_goes_on(capsys):
+    progress = Progress(show=True, every=0.3)
+    with progress.alive():
+        for _ in progress.track(range(2), 3, "work"):
+            time.sleep(0.9)
+    error = capsys.readouterr().err
+    assert "\r\x1b[Kwork 1/3  1 s so far" in error and "\n" not in error
+
+
+@pytest.mark.parametrize(
+    ("expected", "elapsed", "ran", "rest", "said"),
+    [
+        (None, 10, 0, None, ""),  # nothing is known
+        (None, 10, 5, 20, "  about 20 s left"),  # the rate alone
+        (100, 40, 0, None, "  about 60 s left"),  # the forecast alone
+        (100, 10, 2, 900, "  about 2 min left"),  # one slow batch of a stage that has just begun
+        (100, 60, 50, 90, "  about 65 s left"),  # both, as much as each is worth
+        (100, 130, 100, 40, "  about 40 s left"),  # longer than expected: the rate alone
+        (100, 130, 0, None, ""),
+    ],
+)
+def test_time_left_is_the_forecast_until_the_rate_is_known(expected, elapsed, ran, rest, said):
+    progress = Progress(show=False, expected=expected)
+    progress.began -= elapsed
+    assert progress._left(ran, rest) == said
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(0, "5 s"), (42, "40 s"), (99, "100 s"), (100, "2 min"), (720, "12 min"), (9000, "2.5 h")],
+)
+def test_times_are_said_as_people_say_them(seconds, said):
+    assert duration(seconds) == said

@@ -10,7 +10,7 @@ from chebsplat.formats.lesson import Lesson
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.blend import familiar
 from chebsplat.shape.lessons import scale_of, summed
-from chebsplat.stages.recall import taught, trusted, why
+from chebsplat.stages.recall import combine_lessons, trusted, why
 
 P, L = 8, 6  # features, labels
 MAP = np.random.default_rng(1).normal(size=(P, L))
@@ -86,30 +86,32 @@ def test_a_lesson_is_trusted_as_far_as_shape_and_teacher_are_of_one_mind():
 def test_lessons_teach_the_same_in_any_order_and_leave_nothing_when_they_are_forgotten(start):
     lessons = {f"{k:02d}": scene(k, permuted=k == 5, length=1 + 0.1 * k) for k in range(12)}
     lessons["99"] = Lesson((np.zeros((P, P)), np.zeros((P, L)), 0.0), {"none": "no surface"})
-    whole = taught(start, lessons)
+    whole = combine_lessons(start, lessons)
     assert [of["key"] for of in whole.lessons["of"]] == sorted(lessons)[:-1]
     assert [of["key"] for of in whole.lessons["of"] if of["trust"] <= 0.1] == ["05"]
     for seed in range(3):
         order = np.random.default_rng(seed).permutation(sorted(lessons))
-        again = taught(start, {key: lessons[key] for key in order})
+        again = combine_lessons(start, {key: lessons[key] for key in order})
         assert (
             again.map.tobytes() == whole.map.tobytes()
             and again.basis.tobytes() == whole.basis.tobytes()
         )
         assert again.lessons == whole.lessons
-        renamed = taught(start, {f"{place:02d}": lessons[key] for place, key in enumerate(order)})
+        renamed = combine_lessons(
+            start, {f"{place:02d}": lessons[key] for place, key in enumerate(order)}
+        )
         # float32's own
         np.testing.assert_allclose(renamed.map, whole.map, rtol=0, atol=1e-6 * abs(whole.map).max())
-    never = taught(start, {key: of for key, of in lessons.items() if key != "03"})
+    never = combine_lessons(start, {key: of for key, of in lessons.items() if key != "03"})
     assert not np.array_equal(never.map, whole.map)
     lessons.pop("03")
-    left = taught(start, lessons)
+    left = combine_lessons(start, lessons)
     assert (left.map.tobytes(), left.basis.tobytes()) == (
         never.map.tobytes(),
         never.basis.tobytes(),
     )
     assert left.lessons == never.lessons
-    without_wrong = taught(start, {key: of for key, of in lessons.items() if key != "05"})
+    without_wrong = combine_lessons(start, {key: of for key, of in lessons.items() if key != "05"})
     # who is not trusted teaches nothing
     np.testing.assert_allclose(without_wrong.map, left.map, atol=1e-6)
 
@@ -120,12 +122,12 @@ def test_what_is_known_grows_by_trusted_lessons_of_another_kind(start):
     sums = summed(z, np.ones((9, L)), np.ones(9))
 
     def known(**notes):
-        basis = taught(
+        basis = combine_lessons(
             start, {"a": Lesson((sums.gram, sums.cross, sums.square), scene(3).notes | notes)}
         ).basis
         return float(basis[6] @ basis[6])
 
-    before = taught(start, {}).basis[6] @ taught(start, {}).basis[6]
+    before = combine_lessons(start, {}).basis[6] @ combine_lessons(start, {}).basis[6]
     assert before < 0.9
     assert known(novelty=0.2) > 0.95
     assert known(novelty=0.1) == known(novelty=0.2, alike=0.2) == pytest.approx(before)

@@ -66,7 +66,15 @@ def test_the_report_is_one_page_that_fetches_nothing(toy):
     assert text.count("<svg") == 4
     for told in ("LPIPS", "IoU by class", "Every setting", "make view scene="):
         assert told in text
-    assert (toy["report"] / "figures.csv").read_text().startswith("figure,")
+    with (toy["report"] / "figures.csv").open() as handle:
+        rows = list(csv.DictReader(handle))
+    for row in rows:
+        assert all(not row[of] or np.isfinite(float(row[of])) for of in ("scene", "2D teacher"))
+    scores = read_manifest(toy["evaluate"]).facts
+    held = {row["figure"].partition(" (")[0]: row["scene"] for row in rows}
+    assert float(held["mIoU, %"]) == pytest.approx(100 * scores["miou"])
+    assert float(held["PSNR, dB"]) == pytest.approx(scores["psnr"])
+    assert "Gaussians of SH degree 0" in held
     assert (toy["report"] / "trace.csv").read_text().startswith("step,seconds,")
 
 

@@ -60,7 +60,8 @@ def test_the_page_tells_which_lessons_a_scene_started_from_what_they_were_worth_
 ):
     page = page_of(tmp_path)
     for told in (
-        "What this scene started from", "taught over 80 generated rooms", "1 of 1 are trusted", "attic",
+        "What this scene started from", "taught over 80 generated rooms", "1 of 1 are trusted",
+        "attic",
         "its labels were given", "0.9012 without it, 0.9134 with it",
         "ρ 0.200, σ_f 0.900, ρ′ 0.218: new in kind", "1,234 points, 5 labels", "not learned: yoke",
         "shape has 70% of its labels alike, and is 0.50 as sure",

@@ -18,11 +18,11 @@ from chebsplat.formats.lesson import read_notes
 from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.lifting.surface import Surface
 from chebsplat.pipelines.planning.plan import Planner
-from chebsplat.pipelines.planning.sequences import teaching
+from chebsplat.pipelines.planning.sequences import plan_teaching
 from chebsplat.shape.point_inputs import point_inputs
 from chebsplat.splats.gaussians import local_shape
 from chebsplat.stages.onnx import ENCODER, first
-from chebsplat.stages.recall import taught
+from chebsplat.stages.recall import combine_lessons
 from chebsplat.stages.registry import OF_KNOWLEDGE
 from chebsplat.stages.settings import TeachSection
 from chebsplat.stages.shape_models import surfaces, teaching_rooms
@@ -78,17 +78,17 @@ def test_another_teacher_has_none_until_it_is_taught(quick_plans, tmp_path):
     steps, left_out = planned(f"teacher.kind=onnx,teacher.model={model}")
     assert not steps.keys() & set(OF_KNOWLEDGE) and "knowledge" not in steps["refine"].inputs
     assert all("chebsplat knowledge teach" in left_out[stage] for stage in OF_KNOWLEDGE)
-    plan = teaching(Planner(), model, "teach.n_rooms=2,teach.seed=3")
+    plan = plan_teaching(Planner(), model, "teach.n_rooms=2,teach.seed=3")
     assert [step.stage for step in plan.steps] == ["channels", "teach"]
     assert (
         plan.steps[1].sections["teach"].items()
         >= {"n_rooms": 2, "seed": 3, "model": str(model)}.items()
     )
-    other = teaching(Planner(), None, f"teach.model={model}").steps[1].sections
+    other = plan_teaching(Planner(), None, f"teach.model={model}").steps[1].sections
     assert other["teach"]["model"] == str(model)
     closed = color_teacher(tmp_path, name="closed", output="logits")
     with pytest.raises(ConfigError, match="output is logits"):
-        teaching(Planner(), closed)
+        plan_teaching(Planner(), closed)
 
 
 def test_no_room_of_knowledge_is_one_of_a_scene_a_test_or_the_teacher():
@@ -126,7 +126,7 @@ def test_what_ships_is_whole_small_and_says_what_it_was_taught():
     assert knowledge.card["held_out"]["shape"] > 0.8
     assert set(CLASS_NAMES) <= set(knowledge.words)
     # no lesson adds nothing
-    np.testing.assert_allclose(taught(knowledge, {}).map, knowledge.map, atol=1e-4)
+    np.testing.assert_allclose(combine_lessons(knowledge, {}).map, knowledge.map, atol=1e-4)
 
 
 @pytest.mark.xdist_group("toy")
@@ -179,8 +179,8 @@ def refined(toy, out, config=None, **changes):
 def test_labels_without_a_word_are_named_and_the_rest_of_knowledge_counts(toy, tmp_path):
     assert "knowledge" not in refined(toy, tmp_path / "a", knowledge=None)
     features = Features.read(toy["teacher"])
-    for names, what in (([*features.label_names[:-1], "thingamajig"], "votes of shape on some "
-                                                                      "labels"),
+    for names, what in (([*features.label_names[:-1], "thingamajig"],
+                         "votes of shape on some labels"),
                         ([f"thing{'amajig' * k}" for k in range(1, 1 + len(features.label_names))],
                          "knowledge of shape")):  # fmt: skip
         features.label_names = names
@@ -236,7 +236,7 @@ def test_without_measured_depth_knowledge_is_asked_of_swept_depth_or_left_out(
         ("too little", "on", 0.9),
         ("none", "off", 0.1),
     ):
-        monkeypatch.setattr(surfaces, "LEAST_TOLD", least)  # the toy's photos tell a fifth
+        monkeypatch.setattr(surfaces, "LEAST_SWEPT", least)  # the toy's photos tell a fifth
         config, made = (
             withheld | {"sfm": {"max_points": 300, "dense": dense}},
             toy | {"ingest": tmp_path / "ingest"},

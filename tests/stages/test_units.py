@@ -21,7 +21,7 @@ from chebsplat.settings import TrainSection
 from chebsplat.stages.sources import generated
 from chebsplat.stages.tools.page import foreign
 from chebsplat.stages.tools.scene import OpenedScene
-from chebsplat.stages.training.assembly import started
+from chebsplat.stages.training.assembly import read_start
 
 CHANGES = {
     "as it is": (1.0, 0.0),
@@ -101,7 +101,7 @@ def test_units_and_origin_change_neither_the_picture_nor_what_is_exported(scenes
     assert np.abs(moved - origin - scale * ends).max() < 0.02 * scale * (ends[1] - ends[0]).max()
     sizes = [np.median(read_ply(ply)[0]["log_scales"]) for ply in files]
     assert sizes[1] - sizes[0] == pytest.approx(np.log(scale), abs=0.05)
-    begun = started(
+    begun = read_start(
         files[1], points, TrainSection(), Capture.read(opened.source.parent / "ingest")
     )["means"].numpy()
     assert np.allclose(begun, opened.parameters["means"], atol=1e-5)
@@ -129,7 +129,7 @@ def test_a_given_splat_of_one_colour_begins_with_the_points_colours_and_another_
 ):
     _, opened, _, points = scenes["tiny"]
     given = opened.parameters
-    own = started(
+    own = read_start(
         opened.source / "scene.ply",
         points,
         TrainSection(),
@@ -138,7 +138,7 @@ def test_a_given_splat_of_one_colour_begins_with_the_points_colours_and_another_
     assert np.allclose(own["sh0"], given["sh0"])
     sh0 = np.full_like(given["sh0"], (color - 0.5) / 0.28209479177387814)
     write_ply(tmp_path / "one.ply", given | {"sh0": sh0}, 0, world=opened.world)
-    found = started(
+    found = read_start(
         tmp_path / "one.ply", points, TrainSection(), Capture.read(opened.source.parent / "ingest")
     )
     nearest = np.linalg.norm(given["means"][:, None] - points.means, axis=-1).argmin(1)

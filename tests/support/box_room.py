@@ -58,8 +58,10 @@ def room(n=N, seed=0):
     )
     features = words()[labels] * rng.uniform(0.8, 1.2, (n, 1)) + rng.normal(0, 0.1, (n, 8))
     parameters = {
-        "means": means, "log_scales": log_scales, "quats": quats, "logit_opacities": rng.normal(1.5, 1.0, n),
-        "sh0": (0.5 + 0.4 * np.sin(phase) - 0.5)[:, None] / C0, "shN": np.zeros((n, 15, 3)), "features": features,
+        "means": means, "log_scales": log_scales, "quats": quats,
+        "logit_opacities": rng.normal(1.5, 1.0, n),
+        "sh0": (0.5 + 0.4 * np.sin(phase) - 0.5)[:, None] / C0, "shN": np.zeros((n, 15, 3)),
+        "features": features,
     }  # fmt: skip
     parameters = {name: values.astype(np.float32) for name, values in parameters.items()}
     parameters["shN"][: n // 2, :3] = rng.normal(0, 0.15, (n // 2, 3, 3))

@@ -13,20 +13,24 @@ addEventListener("load", () => {
   const seen = image => getComputedStyle(image).display != "none";
   const stage = () => [...document.querySelectorAll(".stage img")].filter(seen);
   const modes = [...document.querySelectorAll(".modes button:not(.next)")].reverse();
-  const layers = Object.fromEntries(modes.map(button => (button.click(), [button.textContent, stage().length])));
+  const layers = Object.fromEntries(
+    modes.map(button => (button.click(), [button.textContent, stage().length])));
   document.querySelectorAll(".modes button").forEach(button => button.click());
   document.querySelectorAll("details").forEach(part => part.open = true);
-  const called = part => `${part.tagName}.${part.className}: ${part.textContent.trim().slice(0, 60)}`;
+  const called = part =>
+    `${part.tagName}.${part.className}: ${part.textContent.trim().slice(0, 60)}`;
   const cut = [...document.querySelectorAll("main, main *:not(svg *)")].filter(part => {
     const box = part.getBoundingClientRect();
-    const scrolls = getComputedStyle(part).overflowX != "visible" && part.scrollWidth > part.clientWidth + 1;
+    const scrolls = getComputedStyle(part).overflowX != "visible"
+      && part.scrollWidth > part.clientWidth + 1;
     return box.width && (scrolls || box.right > innerWidth + 1 || box.left < -1);
   }).map(called);
   parent.postMessage({ wide: document.documentElement.scrollWidth, problems, layers, cut,
     shown: stage().map(image => image.naturalWidth) }, "*");
 });</script>"""
 FRAME = """<body><pre></pre><script>
-addEventListener("message", event => document.querySelector("pre").textContent = JSON.stringify(event.data));
+addEventListener("message", event =>
+  document.querySelector("pre").textContent = JSON.stringify(event.data));
 </script><iframe src="page.html" style="border: 0; width: WIDEpx; height: 900px"></iframe></body>"""
 
 

@@ -14,7 +14,8 @@ from pathlib import Path
 
 from browser import BROWSER
 
-FLAGS = ("--headless=new", "--no-sandbox", "--no-first-run", "--hide-scrollbars", "--remote-debugging-pipe",
+FLAGS = ("--headless=new", "--no-sandbox", "--no-first-run", "--hide-scrollbars",
+         "--remote-debugging-pipe",
          "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
          "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1")  # fmt: skip
 
@@ -152,7 +153,8 @@ def driven(folder):
     shell = ["bash", "-c", f'exec "$@" 3<&{ours[0]} 4>&{theirs[1]}', "browser", *command]
     with open(folder / "browser.log", "w") as log_file:
         process = subprocess.Popen(
-            shell, pass_fds=(ours[0], theirs[1]), stdin=subprocess.DEVNULL, stdout=log_file, stderr=log_file,
+            shell, pass_fds=(ours[0], theirs[1]), stdin=subprocess.DEVNULL, stdout=log_file,
+            stderr=log_file,
             start_new_session=True,
         )  # fmt: skip
     os.close(ours[0])

@@ -6,12 +6,12 @@ import re
 from html.parser import HTMLParser
 
 NAMES = [
-    "<svg><script>alert(1)</script>", "<img src=x onerror=alert(1)>", "\"><b onmouseover='alert(1)'>",
-    "</script><script>alert(1)</script>", "</style></textarea>--><script>alert(1)</script>", "a_b_c *x*", "`rm -rf`",
-    "{{ 7 * 7 }}{% if %}", "$x$ and $\\frac", "[a](javascript:alert(1))", "| a | b |", "# a", "&lt;b&gt; "
-                                                                                              ""
-                                                                                              ""
-                                                                                              "&amp;",
+    "<svg><script>alert(1)</script>", "<img src=x onerror=alert(1)>",
+    "\"><b onmouseover='alert(1)'>",
+    "</script><script>alert(1)</script>", "</style></textarea>--><script>alert(1)</script>",
+    "a_b_c *x*", "`rm -rf`",
+    "{{ 7 * 7 }}{% if %}", "$x$ and $\\frac", "[a](javascript:alert(1))", "| a | b |", "# a",
+    "&lt;b&gt; &amp;",
     "_x", "x" * 200,
 ]  # fmt: skip
 

@@ -108,18 +108,25 @@ def write_seven_scenes(folder, fields, suffix="png", unknown=65_535):
 
 # ScanNet's raw ids of the 20 shared classes, the same in both of its tables; 22 is books, which
 # both call other props.
-SCANNET_IDS = {"wall": 1, "floor": 3, "cabinet": 7, "bed": 11, "chair": 2, "sofa": 6, "table": 4, "door": 5,
-               "window": 16, "shelves": 8, "counter": 35, "curtain": 21, "ceiling": 41, "refrigerator": 27,
+SCANNET_IDS = {"wall": 1, "floor": 3, "cabinet": 7, "bed": 11, "chair": 2, "sofa": 6, "table": 4,
+               "door": 5,
+               "window": 16, "shelves": 8, "counter": 35, "curtain": 21, "ceiling": 41,
+               "refrigerator": 27,
                "television": 33, "person": 80, "toilet": 17, "sink": 14, "lamp": 28, "bag": 47,
                "otherprop": 22}  # fmt: skip
-COCO_IDS = {"wall": 1, "floor": 2, "cabinet": 3, "bed": 4, "chair": 5, "sofa": 6, "table": 7, "door": 8, "window": 9,
-            "shelves": 10, "counter": 11, "curtain": 12, "ceiling": 13, "refrigerator": 14, "television": 15,
-            "person": 16, "toilet": 17, "sink": 18, "lamp": 19, "bag": 20, "otherprop": 0}  # fmt: skip
-NYU_IDS = {"wall": 1, "floor": 2, "cabinet": 3, "bed": 4, "chair": 5, "sofa": 6, "table": 7, "door": 8, "window": 9,
-           "shelves": 15, "counter": 12, "curtain": 16, "ceiling": 22, "refrigerator": 24, "television": 25,
-           "person": 31, "toilet": 33, "sink": 34, "lamp": 35, "bag": 37, "otherprop": 23}  # fmt: skip
-REDUCED_IDS = {"counter": 10, "shelves": 11, "otherprop": 21} | {
-    name: k for name, k in COCO_IDS.items() if name not in ("counter", "shelves", "otherprop")}  # fmt: skip
+COCO_IDS = {"wall": 1, "floor": 2, "cabinet": 3, "bed": 4, "chair": 5, "sofa": 6, "table": 7,
+            "door": 8, "window": 9,
+            "shelves": 10, "counter": 11, "curtain": 12, "ceiling": 13, "refrigerator": 14,
+            "television": 15,
+            "person": 16, "toilet": 17, "sink": 18, "lamp": 19, "bag": 20,
+            "otherprop": 0}  # fmt: skip
+NYU_IDS = {"wall": 1, "floor": 2, "cabinet": 3, "bed": 4, "chair": 5, "sofa": 6, "table": 7,
+           "door": 8, "window": 9,
+           "shelves": 15, "counter": 12, "curtain": 16, "ceiling": 22, "refrigerator": 24,
+           "television": 25,
+           "person": 31, "toilet": 33, "sink": 34, "lamp": 35, "bag": 37,
+           "otherprop": 23}  # fmt: skip
+REDUCED_IDS = COCO_IDS | {"counter": 10, "shelves": 11, "otherprop": 21}
 
 
 def write_table(path, column, values):

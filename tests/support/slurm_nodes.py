@@ -96,7 +96,8 @@ class Slurm:
     def start(self, name, *command):
         with open(self.folder / f"{name}.words", "ab") as words:
             self.processes[name] = subprocess.Popen(
-                [shutil.which(command[0], path=PLACES), *command[1:]], env=os.environ | self.environment,
+                [shutil.which(command[0], path=PLACES), *command[1:]],
+                env=os.environ | self.environment,
                 stdin=subprocess.DEVNULL, stdout=words, stderr=words, start_new_session=True,
             )  # fmt: skip
 
@@ -107,10 +108,12 @@ class Slurm:
         key = self.folder / "munge.key"
         key.write_bytes(os.urandom(128))
         key.chmod(0o600)
-        places = {"socket": "munge.socket", "key-file": key.name, "pid-file": "munge.pid", "log-file": "munge.log",
+        places = {"socket": "munge.socket", "key-file": key.name, "pid-file": "munge.pid",
+                  "log-file": "munge.log",
                   "seed-file": "munge.seed"}  # fmt: skip
         self.start("munge", "munged", "--foreground", "--force",
-                   *(f"--{option}={self.folder / file}" for option, file in places.items()))  # fmt: skip
+                   *(f"--{option}={self.folder / file}"
+                     for option, file in places.items()))  # fmt: skip
         self.wait_for(lambda: (self.folder / "munge.socket").exists(), "munge", 20)
         self.start("slurmctld", "slurmctld", "-D", "-c", "-f", self.folder / "slurm.conf")
         for name in self.nodes:

@@ -70,10 +70,13 @@ def tiny(n=3, size=(8, 6)):
     number = np.broadcast_to(np.arange(n)[:, None, None], (n, height, width))
     poses = np.tile(np.eye(4), (n, 1, 1))
     poses[:, 0, 3] = -np.arange(n)
-    return {"images": np.repeat(number[..., None], 3, 3).astype(np.uint8), "depth": 1 + number / 1000,
+    return {"images": np.repeat(number[..., None], 3, 3).astype(np.uint8),
+            "depth": 1 + number / 1000,
             "labels": (number % 3 - 1).astype(np.int16), "class_names": ["wall", "floor"],
-            "Ks": np.tile([[10, 0, width / 2], [0, 10, height / 2], [0, 0, 1]], (n, 1, 1)), "cam_from_world": poses,
-            "points": np.eye(3, dtype=np.float32), "point_colors": np.zeros((3, 3), np.uint8)}  # fmt: skip
+            "Ks": np.tile([[10, 0, width / 2], [0, 10, height / 2], [0, 0, 1]], (n, 1, 1)),
+            "cam_from_world": poses,
+            "points": np.eye(3, dtype=np.float32),
+            "point_colors": np.zeros((3, 3), np.uint8)}  # fmt: skip
 
 
 def write_transforms(folder, n=3, **changes):

@@ -113,7 +113,8 @@ def rasterization(
     def render(*gaussians: Tensor) -> tuple[Tensor, Tensor]:
         image, alpha, found = reference.rasterize(
             *gaussians, viewmats, Ks, width, height,
-            near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, max_alpha=CEILING, rasterize_mode=rasterize_mode,
+            near_plane=near_plane, far_plane=far_plane, eps2d=eps2d, max_alpha=CEILING,
+            rasterize_mode=rasterize_mode,
             backgrounds=backgrounds, absgrad=absgrad,
         )  # fmt: skip
         meta.update(found)

@@ -52,9 +52,9 @@ def test_a_held_out_room_is_told_about_as_well_as_the_published_figures_say():
     for image, truth in held_out_room(layout.HELD_OUT[0], n_views=4):
         matrix += confusion(labelled(encode(image), texts, *truth.shape), truth, n)
     assert published["miou"] >= 0.55
-    # one room of twenty, four views
-    assert segmentation(matrix).miou == pytest.approx(published["miou"], abs=0.15)
-    assert segmentation(matrix).oa == pytest.approx(published["oa"], abs=0.08)
+    # one room of twenty, four views: 0.046 and 0.011 below
+    assert segmentation(matrix).miou == pytest.approx(published["miou"], abs=0.06)
+    assert segmentation(matrix).oa == pytest.approx(published["oa"], abs=0.02)
 
 
 def test_no_seed_serves_two_ends():

@@ -34,7 +34,8 @@ CODE = re.compile(
 )
 LINK = re.compile(r"\]\(([^)#:]+)\)")
 RECORDS = (
-    Capture, Points, ChannelMap, Features, ViewAgreement, Descriptors, Encoding, Checkpoint, Lifted, Refined,
+    Capture, Points, ChannelMap, Features, ViewAgreement, Descriptors, Encoding, Checkpoint, Lifted,
+    Refined,
     RaggedScene, Pictures,
 )  # fmt: skip
 

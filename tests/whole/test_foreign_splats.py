@@ -2,7 +2,8 @@
 theirs.
 """
 
-import chebsplat.kernels.jit  # noqa: F401  # isort: skip  # gsply runs on numba too: the threading layer is chosen first
+# gsply runs on numba too: the threading layer is chosen first
+import chebsplat.kernels.jit  # noqa: F401  # isort: skip
 
 import numpy as np
 import pytest

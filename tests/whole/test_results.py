@@ -30,7 +30,8 @@ def known(commit):
 
 def dated(commit):
     """When a commit was made, UTC, to the minute."""
-    return f"{datetime.fromtimestamp(int(git('log', '-1', '--format=%ct', commit).stdout), UTC):%Y-%m-%d %H:%M}"
+    seconds = int(git("log", "-1", "--format=%ct", commit).stdout)
+    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M}"
 
 
 def recipe():

@@ -18,7 +18,8 @@ case "$*" in
     mkdir -p .venv/bin .venv/site/open3d
     cp "$0" .venv/bin/python
     printf '#!%s/.venv/bin/python\\n' "$here" > .venv/bin/chebsplat
-    printf 'home = /usr/bin\\ncommand = /usr/bin/python3.11 -m venv %s/.venv\\n' "$here" > .venv/pyvenv.cfg ;;
+    printf 'home = /usr/bin\\ncommand = /usr/bin/python3.11 -m venv %s/.venv\\n' "$here" \\
+      > .venv/pyvenv.cfg ;;
   *purelib*) echo .venv/site ;;
   *"cuda is None"*) exit ${CPU_TORCH:-0} ;;
   *sys.version_info*) echo cp${TAG:-311} ;;
@@ -178,11 +179,13 @@ def test_device_cuda_is_refused_where_there_is_no_driver(clone):
 
 # of whatever make calls: keeps what it is given
 STUB = '#!/bin/bash\nprintf \'%s\\0\' "$@" > "$CALLS"\n'
-HOSTILE = ["Anna's room", 'a "b" room', "$5 $(shell touch x) $$ `touch x`", "'; touch x; '", '"; touch x; '
+HOSTILE = ["Anna's room", 'a "b" room', "$5 $(shell touch x) $$ `touch x`", "'; touch x; '",
+           '"; touch x; '
                                                                                              ''
                                                                                              ''
                                                                                              '"',
-           "a\nb", " # two  spaces \\", "-x;touch x", "*", "$(error no) ${HOME}", "été %s"]  # fmt: skip
+           "a\nb", " # two  spaces \\", "-x;touch x", "*", "$(error no) ${HOME}",
+           "été %s"]  # fmt: skip
 CALLED = [  # goals, variables that get the name, what the command gets of it
     ([], ["scene", "set", "stage"], ["run", "--scene={}", "--set={}", "--stage={}"]),
     (

@@ -25,7 +25,8 @@ from chebsplat.views import View
 
 WHOLE = {
     "steps": 40, "densify_from": 0.1, "densify_until": 0.6, "prune_from": 0.2, "sh_freeze": 0.8,
-    "refresh_every": 12, "remove_every": 6, "max_gaussians": 1200, "report_every": 20, "n_densify": 4,
+    "refresh_every": 12, "remove_every": 6, "max_gaussians": 1200, "report_every": 20,
+    "n_densify": 4,
     "grow_threshold": 1e-6, "coarse_until": 0.5,
 }  # fmt: skip
 REGIONS = {"n_regions": 24, "region_size": 8}

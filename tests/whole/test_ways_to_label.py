@@ -35,7 +35,8 @@ def made(scene, tmp_path_factory):
     write(folder / "scene", scene, pictures(IDS))
     inputs = {}
     given = {
-        "ingest": (), "sfm": ("capture",), "teacher": ("capture",), "train": ("capture", "points", "features"),
+        "ingest": (), "sfm": ("capture",), "teacher": ("capture",),
+        "train": ("capture", "points", "features"),
         "export": ("gaussians", "features"), "evaluate": ("capture", "scene", "features"),
     }  # fmt: skip
     of = {

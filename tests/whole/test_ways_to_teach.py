@@ -30,7 +30,8 @@ def capture(tmp_path_factory):
         np.array(list(COLORS.values()))[labels] * 60 + 127 + rng.normal(0, 20, (*labels.shape, 3))
     )
     record = Capture(
-        [f"{k}.png" for k in range(4)], colors.clip(0, 255).astype(np.uint8), np.tile(np.eye(3), (4, 1, 1)), None,
+        [f"{k}.png" for k in range(4)], colors.clip(0, 255).astype(np.uint8),
+        np.tile(np.eye(3), (4, 1, 1)), None,
         np.arange(4) == 0, labels=labels, class_names=list(COLORS),
     )  # fmt: skip
     return published(tmp_path_factory.mktemp("capture") / "capture", record)
@@ -119,35 +120,35 @@ WAYS = {  # how it is brought, and a word of what is said, "" where nothing need
     "weights in _data": (lambda f: beside(f, "model.onnx_data"), ""),
     "weights in weights.bin": (lambda f: beside(f, "weights.bin"), ""),
     "softmax": (lambda f: segmenter(f, SIGNED, SOFTMAX), "gives values of softmax, not logits"),
-    "softmax in float16": (lambda f: segmenter(f, SIGNED, SOFTMAX, HALF, FLOAT), "values of softmax"),
+    "softmax in float16": (lambda f: segmenter(f, SIGNED, SOFTMAX, HALF, FLOAT),
+                           "values of softmax"),
     "log-softmax": (lambda f: segmenter(f, SIGNED, node("LogSoftmax", axis=1)), ""),
     "sigmoid": (lambda f: segmenter(f, SIGNED, node("Sigmoid")), "values of sigmoid"),
-    "cosines": (lambda f: segmenter(f, SIGNED, node("LpNormalization", axis=1)), "values of cosines"),
-    "no output in the TOML": (lambda f: segmenter(f, SIGNED, output=None), "has no `output`: logits"),
+    "cosines": (lambda f: segmenter(f, SIGNED, node("LpNormalization", axis=1)),
+                "values of cosines"),
+    "no output in the TOML": (lambda f: segmenter(f, SIGNED, output=None),
+                              "has no `output`: logits"),
     "no map first": (lambda f: of_outputs(f, "flat", "features"), ": features is taken"),
-    "a map of other channels first": (lambda f: of_outputs(f, "twice", "features"), ": features is "
-                                                                                    "taken"),
+    "a map of other channels first": (lambda f: of_outputs(f, "twice", "features"),
+                                      ": features is taken"),
     "two maps alike": (
         lambda f: of_outputs(f, "features", "same"), "same [1, 3, 12, 16]: more than one fits"
     ),
     "two maps alike, one named": (lambda f: of_outputs(f, "features", "same", tensor="same"), ""),
     "two maps alike, none of that name": (
-        lambda f: of_outputs(f, "features", "same", tensor="sane"), "no output is called sane: there are features [1, "
-                                                                    ""
-                                                                    ""
-                                                                    "3"
+        lambda f: of_outputs(f, "features", "same", tensor="sane"),
+        "no output is called sane: there are features [1, 3"
     ),
     "no map that fits": (lambda f: of_outputs(f, "twice", "four"), "none fits"),
-    "channels last": (lambda f: segmenter(f, SIGNED, node("Transpose", perm=[0, 2, 3, 1])), "channels come "
-                                                                                            ""
-                                                                                            ""
-                                                                                            "last"),
+    "channels last": (lambda f: segmenter(f, SIGNED, node("Transpose", perm=[0, 2, 3, 1])),
+                      "channels come last"),
     "the likeliest class alone": (likeliest, "the likeliest class alone"),
-    "and as numbers": (lambda f: segmenter(f, SIGNED, node("ArgMax", axis=1), FLOAT), "names 3 "
-                                                                                      "classes"),
+    "and as numbers": (lambda f: segmenter(f, SIGNED, node("ArgMax", axis=1), FLOAT),
+                       "names 3 classes"),
     "channels last, of photos": (channels_last_in, "one image [1, 3, H, W] is needed"),
     "mean and std of 0 to 255": (
-        lambda f: segmenter(f, IMAGENET, mean=[123.675, 116.28, 103.53], std=[58.395, 57.12, 57.375]),
+        lambda f: segmenter(f, IMAGENET, mean=[123.675, 116.28, 103.53],
+                            std=[58.395, 57.12, 57.375]),
         "write mean = [0.485, 0.456, 0.406], std = [0.229, 0.224, 0.225]",
     ),
     "Caffe's mean and std": (
@@ -155,7 +156,8 @@ WAYS = {  # how it is brought, and a word of what is said, "" where nothing need
         "write mean = [0.4078, 0.4588, 0.4824], std = [0.003922, 0.003922, 0.003922]",
     ),
     "a name too many": (
-        lambda f: (segmenter(f, SIGNED), (f / "classes.txt").write_text("background\nred\ngreen\nblue\n")),
+        lambda f: (segmenter(f, SIGNED),
+                   (f / "classes.txt").write_text("background\nred\ngreen\nblue\n")),
         "names 4 classes",
     ),
     "weights left behind": (

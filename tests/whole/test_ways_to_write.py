@@ -64,7 +64,8 @@ def scene():
         tracks += [(point, k) for point in seen[np.abs(met / at[seen, 2] - 1) < 0.03]]
     held = {name: fields[name] for name in ("names", "images", "labels", "class_names")}
     return held | {
-        "cam_from_world": poses, "Ks": Ks, "depth": depth, "points": points, "colors": np.concatenate(colors),
+        "cam_from_world": poses, "Ks": Ks, "depth": depth, "points": points,
+        "colors": np.concatenate(colors),
         "tracks": np.array(sorted(tracks)),
     }  # fmt: skip
 
@@ -102,7 +103,8 @@ def sorted_by_degree(parameters):
 # writers
 
 
-def colmap(folder, scene, *, model="PINHOLE", more="", name="{}.png", place="sparse/0", images="images", keypoints=None,
+def colmap(folder, scene, *, model="PINHOLE", more="", name="{}.png", place="sparse/0",
+           images="images", keypoints=None,
            way=AS_IT_IS, colors=None, tracks=True, size=1, views=range(16), camera="{w} {h}",
            errors=0.5, depth=None, binary=False, file=None, separate=False):  # fmt: skip
     """A model as COLMAP writes one, but for what is asked for.
@@ -180,7 +182,8 @@ def colmap(folder, scene, *, model="PINHOLE", more="", name="{}.png", place="spa
             path.unlink()
 
 
-def transforms(folder, scene, *, shared=None, frame=None, rows=4, path="images/{}.png", scale=1.0, shift=0.0,
+def transforms(folder, scene, *, shared=None, frame=None, rows=4, path="images/{}.png", scale=1.0,
+               shift=0.0,
                depth=1000.0, document="transforms.json", drop=(), split=False):  # fmt: skip
     """A transforms.json as nerfstudio writes one, with depth, but for what is asked for."""
     K, (height, width) = scene["Ks"][0], scene["images"].shape[1:3]
@@ -194,7 +197,8 @@ def transforms(folder, scene, *, shared=None, frame=None, rows=4, path="images/{
     }
     whole = {key: value for key, value in (whole | (shared or {})).items() if key not in drop}
     frames = []
-    for name, image, z, pose in zip(scene["names"], scene["images"], scene["depth"], layouts.world_from_cam(scene),
+    for name, image, z, pose in zip(scene["names"], scene["images"], scene["depth"],
+                                    layouts.world_from_cam(scene),
                                     strict=True):  # fmt: skip
         save(folder / "images" / f"{name}.png", image)
         matrix = pose * FLIP
@@ -347,12 +351,18 @@ DEPTH = {
     "inverse depth": (partial(C, depth=lambda z: 25_000 / z - 2000), ""),
     "65535 for unknown": (partial(C, depth=holes), ""),
     "several codes for unknown": (partial(C, depth=partial(holes, codes=(65_535, 50_000, 1))), ""),
-    "depth of other views": (partial(C, depth=lambda z: 1000 * np.roll(z, 5, 0)), r"in no unit.*ingest\.depth=off"),
+    "depth of other views": (partial(C, depth=lambda z: 1000 * np.roll(z, 5, 0)),
+                             r"in no unit.*ingest\.depth=off"),
     "depth half as large": (after(partial(C, **MM), half_depth), "48x36"),
     "transforms.json": (T, ""),
-    "distortion of zero": (partial(T, shared={"camera_model": "OPENCV", "k1": 0, "k2": 0, "p1": 0, "p2": 0}), ""),
-    "a list of distortion": (partial(T, shared={"distortion_params": [0, 0, 0, 0, 0, 0]}), "distortion_params"),
-    "an angle of view": (lambda folder, scene: transforms(folder, scene, drop=("fl_x", "fl_y", "cx", "cy"), shared={
+    "distortion of zero": (partial(T,
+                                   shared={"camera_model": "OPENCV", "k1": 0, "k2": 0, "p1": 0,
+                                           "p2": 0}), ""),
+    "a list of distortion": (partial(T, shared={"distortion_params": [0, 0, 0, 0, 0, 0]}),
+                             "distortion_params"),
+    "an angle of view": (lambda folder,
+                         scene: transforms(folder, scene, drop=("fl_x", "fl_y", "cx", "cy"),
+                                           shared={
         "camera_angle_x": 2 * np.arctan(48 / scene["Ks"][0, 0, 0])}), ""),
     "names without endings": (partial(T, path="images/{}"), ""),
     "names with ./": (partial(T, path="./images/{}.png"), ""),
@@ -362,7 +372,9 @@ DEPTH = {
     "another unit than the depth's": (partial(T, scale=0.3), ""),
     "five thousandths beside transforms.json": (partial(T, depth=5000.0), ""),
     "transforms.json far away": (partial(T, shift=np.array([5e5, 2e5, 10.0])), ""),
-    "intrinsics of each frame": (lambda folder, scene: transforms(folder, scene, shared={"fl_x": 30.0, "fl_y": 30.0},
+    "intrinsics of each frame": (lambda folder,
+                                 scene: transforms(folder, scene,
+                                                   shared={"fl_x": 30.0, "fl_y": 30.0},
         frame={"fl_x": scene["Ks"][0, 0, 0], "fl_y": scene["Ks"][0, 1, 1]}), ""),
 }  # fmt: skip
 WAYS = [

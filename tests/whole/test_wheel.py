@@ -91,6 +91,8 @@ def test_a_wheel_mounts_every_layer_under_chebsplat(wheel):
     tops = {name.split("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"chebsplat"}
     for wanted in (
+        "chebsplat/py.typed",
+        "chebsplat/__init__.pyi",
         "chebsplat/shape/descriptor.py",
         "chebsplat/evaluation/protocols/labels.py",
         "chebsplat/synthetic/layout.py",

@@ -4,13 +4,10 @@ Resolution: 640 pixels at most. Split: the source's own, otherwise every 8th vie
 Classes: the scene's own names; a label whose name is no class is wrong wherever it is predicted.
 One confusion matrix over all test views: mIoU over classes that occur in truth or prediction, mAcc
 over those in the truth, OA; mIoU within 5 pixels of a boundary, and over the five classes with the
-fewest pixels; the same for the teacher.
-3D point mIoU, where depth and poses say where pixels lie: over points of the test views' surfaces
-  (40,000 pixels a view
-on a regular grid, of which one a cell is kept: `metrics.thinned`), the scene's label is that of its
-  Gaussians there,
-without rendering; where it has none, it is wrong. The teacher's is the label of the pixel that the
-point comes from.
+fewest pixels; the same for the teacher. 3D point mIoU, from depth and poses of pixels: over points
+of the test views' surfaces (40,000 pixels a view on a regular grid, of which one a cell is kept:
+`metrics.thinned`), the scene's label is that of its Gaussians there, without rendering; where it
+has none, it is wrong. The teacher's is the label of the pixel that the point comes from.
 """
 
 from __future__ import annotations
@@ -34,7 +31,7 @@ TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
     "labels",
 )
 
-N_RAREST = 5  # classes whose mean IoU is told apart: what means over a scene hardly show
+N_RAREST = 5  # classes whose mean IoU is reported separately
 PER_VIEW = 40_000  # pixels of a view that become points, about, on a regular grid
 
 
@@ -62,8 +59,8 @@ def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
             positions, truth, *of_teacher = (
                 of[step // 2 :: step, step // 2 :: step] for of in maps if of is not None
             )
-            known = (truth != IGNORE) & np.isfinite(positions).all(-1)
-            points.append(tuple(of[known] for of in (positions, truth, *of_teacher)))
+            usable = (truth != IGNORE) & np.isfinite(positions).all(-1)
+            points.append(tuple(of[usable] for of in (positions, truth, *of_teacher)))
     figures = {side: _figures(whole, edges, task.classes) for side, (whole, edges) in sums.items()}
     of_points, there = (
         _point_mious(points, task) if points and task.at is not None else ({}, np.zeros(n))
@@ -87,24 +84,22 @@ def _point_mious(
     """mIoU of scene and teacher over points of surfaces; how many of these are of each class."""
     assert task.at is not None
     positions, truth, *of_teacher = (np.concatenate(parts) for parts in zip(*points, strict=True))
-    kept, n = thinned(positions), len(task.classes)
-    features, weights = task.at(positions[kept])
+    rows, n = thinned(positions), len(task.classes)
+    features, weights = task.at(positions[rows])
     labels = predicted(decode_labels(features, task.embeddings), task.names, task.classes, n)
     sides = {"scene": np.where(weights > 0, labels, n)}
     if of_teacher:
-        sides["teacher"] = predicted(of_teacher[0][kept], task.names, task.classes, n)
-    there = np.bincount(truth[kept], minlength=n)
+        sides["teacher"] = predicted(of_teacher[0][rows], task.names, task.classes, n)
+    there = np.bincount(truth[rows], minlength=n)
     ious = {
-        side: segmentation(confusion(labels, truth[kept], n + 1)).iou
+        side: segmentation(confusion(labels, truth[rows], n + 1)).iou
         for side, labels in sides.items()
     }
     return {side: mean_over(iou[:-1], there) for side, iou in ious.items()}, there
 
 
 def rarest(pixels: np.ndarray) -> np.ndarray:
-    """Of classes with so many pixels of truth each, the N_RAREST with the fewest, those with none
-    aside.
-    """
+    """Indices of the N_RAREST classes with the fewest `pixels` of truth, but more than none."""
     return np.argsort(np.where(pixels > 0, pixels, np.inf), kind="stable")[
         : min(N_RAREST, int((pixels > 0).sum()))
     ]

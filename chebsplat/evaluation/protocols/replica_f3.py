@@ -1,17 +1,14 @@
-"""`replica-f3` (Feature 3DGS): agreement with the teacher's own labels; no ground truth is looked
-at.
+"""`replica-f3` (Feature 3DGS): agreement with the teacher's own labels, without ground truth.
 
 Resolution: 640 pixels at most, as Semantic-NeRF's renders have. Split: index % 8 == 2 by name.
 Feature 3DGS sorts its students as text and its teachers as numbers, so that unpadded names pair
 different views; here views are joined on their names. Labels: the 150 names of ADE20K without a
 prompt template; of ids that count from 1, television (90) becomes door (15), rug (29) floor (4),
-pillow (58) cushion (40).
-Resizing: where a view is wider than 480 pixels, features of both become 480x360, bilinear with
-  aligned corners, which
-distorts; labels then become 159x119 by the nearest pixel. Averaging: by image, mean IoU over the 7
-labels that are most frequent in teacher and student together, and pixel accuracy; then the mean
-over images. Labels of equal frequency are taken in the order of their ids; Feature 3DGS leaves that
-open.
+pillow (58) cushion (40). Resizing: where a view is wider than 480 pixels, features of both become
+480x360, bilinear with aligned corners, which distorts; labels then become 159x119 by the nearest
+pixel. Averaging: by image, mean IoU over the 7 labels that are most frequent in teacher and student
+together, and pixel accuracy; then the mean over images. Labels of equal frequency are taken in the
+order of their ids; Feature 3DGS leaves that open.
 """
 
 from __future__ import annotations
@@ -63,8 +60,8 @@ def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
     if wrong:
         raise DataFailure(
             f"the protocol asks for the 150 labels of ADE20K in their order (label {wrong[0]}: "
-            f"{SPELT[wrong[0]]}); "
-            f"the teacher has {len(task.names)}; give it these, or use another protocol"
+            f"{SPELT[wrong[0]]}); the teacher has {len(task.names)}; give it these, or use "
+            "another protocol"
         )
     rows: list[tuple[float, float]] = []  # (mIoU, OA) of each image
     by_label: dict[int, list[float]] = {k: [] for k in range(1, N_LABELS + 1)}
@@ -106,9 +103,7 @@ def _labels(features: np.ndarray, view: EvaluatedView, embeddings: np.ndarray) -
 
 
 def merged(ids: np.ndarray) -> np.ndarray:
-    """Ids from 1 with the merges applied; none is the target of another, so their order does not
-    matter.
-    """
+    """Ids from 1 with the merges applied, in any order: no target is merged itself."""
     table = np.arange(N_LABELS + 1)
     table[list(MERGED)] = list(MERGED.values())
     result: np.ndarray = table[ids]
@@ -118,6 +113,9 @@ def merged(ids: np.ndarray) -> np.ndarray:
 def frequent_ious(student: np.ndarray, teacher: np.ndarray) -> dict[int, float]:
     """IoU of the N_COUNTED ids that are most frequent in both images together."""
     ids, counts = np.unique(np.concatenate([student, teacher], None), return_counts=True)
-    kept = ids[np.argsort(-counts, kind="stable")][:N_COUNTED]
-    return {int(k): float(np.sum((student == k) & (teacher == k)) / np.sum((student == k) | (teacher == k)))
-            for k in kept}  # fmt: skip
+    frequent = ids[np.argsort(-counts, kind="stable")][:N_COUNTED]
+    masks = {int(k): (student == k, teacher == k) for k in frequent}
+    return {
+        k: float(np.sum(ours & theirs) / np.sum(ours | theirs))
+        for k, (ours, theirs) in masks.items()
+    }

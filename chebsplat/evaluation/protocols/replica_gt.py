@@ -1,8 +1,8 @@
 """`replica-gt` (ours): Replica's own semantic ids as truth, on the views that `replica-f3` tests.
 
-Resolution: as there. Split: index % 8 == 2 by name, whatever the source says. Classes: Replica's
-names, none merged or dropped. One confusion matrix over all test views, as in `labels`: never to be
-put beside `replica-f3`, whose truth is a teacher.
+Resolution: as there. Split: index % 8 == 2 by name, not the source's. Classes: Replica's names,
+none merged or dropped. One confusion matrix over all test views, as in `labels`: never to be put
+beside `replica-f3`, whose truth is a teacher.
 """
 
 from __future__ import annotations

@@ -1,17 +1,13 @@
-"""`scannet-open` (Semantic Gaussians): open vocabulary on 12 scenes of ScanNet, measured on the
-training cameras.
+"""`scannet-open` (Semantic Gaussians): open vocabulary on ScanNet, measured on training cameras.
 
-Split: no view is held out, and every view is evaluated. Truth: `label-filt` through column
-  `cocomapid`; 0 is ignored.
-Classes: the 20 below in this order; ids differ from `scannet-closed` in two places (10 is shelves,
-  11 counter), so
-labels are joined on names, never on ids. A leading prompt "other" is dropped before the largest
-cosine is taken: no pixel can be "other". Resizing: views are 648 pixels wide at most; predictions
-  and truth are compared at
-648x484, nearest pixel. Averaging: ONE confusion matrix summed over all scenes (`summed`); a class
-  that is absent
-from the truth is skipped, even where it is predicted; mIoU and mAcc. A scene's own figures are
-those of its matrix.
+12 scenes. Split: no view is held out, and every view is evaluated. Truth: `label-filt` through
+column `cocomapid`; 0 is ignored. Classes: the 20 below in this order; ids differ from
+`scannet-closed` in two places (10 is shelves, 11 counter), so labels are joined on names, never on
+ids. A leading prompt "other" is dropped before the largest cosine is taken: no pixel can be
+"other". Resizing: views are 648 pixels wide at most; predictions and truth are compared at 648x484,
+nearest pixel. Averaging: ONE confusion matrix summed over all scenes (`summed`); a class that is
+absent from the truth is skipped, even where it is predicted; mIoU and mAcc. A scene's own figures
+are those of its matrix.
 """
 
 from __future__ import annotations
@@ -43,19 +39,20 @@ TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
     True,
     "labels",
 )
-CLASSES = ("wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "shelves", "counter",
-           "curtain", "ceiling", "refrigerator", "television", "person", "toilet", "sink", "lamp", "bag")  # fmt: skip
+CLASSES = (
+    "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "shelves",
+    "counter", "curtain", "ceiling", "refrigerator", "television", "person", "toilet", "sink",
+    "lamp", "bag",
+)  # fmt: skip
 OTHER = "other"
 SIZE = (484, 648)  # (H, W)
 
 
 def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
-    """Figures of one scene, and its `confusion` [20, 20] by truth, to be summed over scenes. Raises
-    DataFailure.
-    """
+    """Figures of one scene and its `confusion` [20, 20] by truth, to sum. Raises DataFailure."""
     required(task.names, CLASSES, NAME, also=(OTHER,))
-    asked = [k for k, name in enumerate(task.names) if joined(name) != OTHER]
-    names, embeddings = [task.names[k] for k in asked], task.embeddings[asked]
+    rows = [k for k, name in enumerate(task.names) if joined(name) != OTHER]
+    names, embeddings = [task.names[k] for k in rows], task.embeddings[rows]
     classes = list(CLASSES)
     sums: dict[str, np.ndarray] = {}
     for view in views:
@@ -75,7 +72,7 @@ def measure(views: Iterable[EvaluatedView], task: Task) -> dict[str, Any]:
 
 
 def over_scenes(scenes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Figures of several scenes together, from what `measure` says of each."""
+    """Figures of several scenes together, from those of each by `measure`."""
     return summed([np.array(scene["confusion"]) for scene in scenes])
 
 

@@ -1,6 +1,4 @@
-"""What a protocol measures: one view after another, what their labels mean, and which are test
-views.
-"""
+"""Input of a protocol: evaluated views one by one, and the names of their labels and classes."""
 
 from __future__ import annotations
 
@@ -37,7 +35,7 @@ class EvaluatedView:
 
 @dataclass
 class Task:
-    """names, embeddings [L, C] of the labels that features are asked for; classes of the truth;
+    """names, embeddings [L, C] of the labels that features are decoded to; classes of the truth;
     boundary: pixels.
 
     at: points [M, 3] of the world -> features [M, C] of the scene there and their weights [M], 0
@@ -52,9 +50,7 @@ class Task:
 
 
 class MapsByName(Mapping[str, np.ndarray]):
-    """Rows of a stack by view name, read when asked for: views are joined on names, never on
-    position.
-    """
+    """Rows of a stack by view name, read on access: views are joined on names, not on position."""
 
     def __init__(self, names: list[str], stack: Any, what: str):
         self.rows, self.stack, self.what = (
@@ -76,16 +72,13 @@ class MapsByName(Mapping[str, np.ndarray]):
 
 
 def counted(pixels: np.ndarray) -> dict[str, int]:
-    """What a mean over classes rests on: how many `classes` the truth has, and its `pixels`, of [L]
-    counts by class.
-    """
+    """Basis of a mean over classes: how many `classes` the truth has, and its `pixels`, of [L]."""
     return {"classes": int((pixels > 0).sum()), "pixels": int(pixels.sum())}
 
 
 def mean_over(values: np.ndarray, pixels: np.ndarray) -> float | None:
-    """Mean of the figures of classes that are defined, not nan; None where the truth, of so many
-    `pixels` by class,
-    has fewer than two: of one class alone any scene that knows no other has 100 %.
+    """Mean of the figures of classes that are not nan; None where the truth has fewer than two by
+    `pixels`: of one class alone any scene that knows no other has 100 %.
     """
     if counted(pixels)["classes"] < 2 or np.isnan(values).all():
         return None
@@ -95,27 +88,21 @@ def mean_over(values: np.ndarray, pixels: np.ndarray) -> float | None:
 def translated(
     labels: np.ndarray, names: list[str], classes: list[str], unknown: int
 ) -> np.ndarray:
-    """Labels among `names` as indices into `classes`, IGNORE kept; a name that is no class becomes
-    `unknown`.
-    """
+    """Labels among `names` as indices into `classes`, IGNORE kept; `unknown` if a name is none."""
     table = np.array([*(unknown if row < 0 else row for row in rows_of(names, classes)), IGNORE])
     result: np.ndarray = table[labels]
     return result
 
 
 def predicted(labels: np.ndarray, names: list[str], classes: list[str], unknown: int) -> np.ndarray:
-    """As `translated`, of a prediction: where there is none, it is `unknown` too, and not left out
-    of the count.
-    """
+    """`translated` of a prediction: IGNORE becomes `unknown` too, which counts as wrong."""
     return np.where(labels == IGNORE, unknown, translated(labels, names, classes, unknown))
 
 
 def required(
     names: list[str], classes: tuple[str, ...], protocol: str, also: tuple[str, ...] = ()
 ) -> None:
-    """Raise DataFailure unless `names` are all the `classes`, in any order, and nothing else but
-    some of `also`.
-    """
+    """Raise DataFailure unless `names` are `classes` in any order, and maybe some of `also`."""
     if absent := lacking(classes, names):
         raise DataFailure(
             f"{protocol} asks for its {len(classes)} classes; the teacher has no "
@@ -143,9 +130,7 @@ def resized(labels: np.ndarray, size: tuple[int, int], centred: bool = False) ->
 
 
 def bilinear(features: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Features [h, w, C] at size (H, W); the corner pixels' centres stay the corners
-    ("align_corners").
-    """
+    """Features [h, w, C] at size (H, W); corner pixels keep their centres ("align_corners")."""
     for axis, n in enumerate(size):
         m = features.shape[axis]
         at = np.linspace(0, m - 1, n)

@@ -52,7 +52,8 @@ def test_the_split_counts_names_as_people_do_in_whatever_order_they_come():
 
 @pytest.mark.parametrize(
     ("protocol", "tests"),
-    [("labels", {0, 8, 16}), ("replica-f3", {2, 10, 18}), ("replica-gt", {2, 10, 18}), ("scannet-open", set()),
+    [("labels", {0, 8, 16}), ("replica-f3", {2, 10, 18}), ("replica-gt", {2, 10, 18}),
+     ("scannet-open", set()),
      ("scannet-closed", {0, 5, 10, 15}), ("deep-blending", {0, 8, 16})],
 )  # fmt: skip
 def test_each_protocol_has_its_own_test_views(protocol, tests):
@@ -373,7 +374,8 @@ def test_scannet_closed_on_paper():
     # counter: 80/88 counter: true 2, predicted 6: 0.6 % is kept, 2/6 right; void 0.4 %, bag 0.4 %
     # and lamp 0.2 +
     # 0.2 % are dropped, although lamp has 0.4 % in both together
-    matrix = closed_matrix(wall_wall=900, wall_void=4, wall_lamp=2, floor_floor=80, floor_bag=4, floor_counter=4,
+    matrix = closed_matrix(wall_wall=900, wall_void=4, wall_lamp=2, floor_floor=80, floor_bag=4,
+                           floor_counter=4,
                            counter_counter=2, lamp_wall=0, lamp_lamp=2, bed_bed=2)  # fmt: skip
     found = scannet_closed.figures(matrix)
     assert found["miou"] == pytest.approx((900 / 906 + 80 / 88 + 2 / 6) / 3)
@@ -383,7 +385,8 @@ def test_scannet_closed_on_paper():
         "counter",
     ]
     # one more pixel predicted void: 0.5 % is not under 0.5 %, and void counts with IoU 0
-    matrix = closed_matrix(wall_wall=899, wall_void=5, wall_lamp=2, floor_floor=80, floor_bag=4, floor_counter=4,
+    matrix = closed_matrix(wall_wall=899, wall_void=5, wall_lamp=2, floor_floor=80, floor_bag=4,
+                           floor_counter=4,
                            counter_counter=2, lamp_lamp=2, bed_bed=2)  # fmt: skip
     found = scannet_closed.figures(matrix)
     assert found["iou"]["void"] == 0

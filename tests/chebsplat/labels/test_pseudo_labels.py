@@ -28,7 +28,8 @@ def test_votes_on_paper():
     assert winners.tolist() == [[1, 1, 2]]
     assert confidence[0] == pytest.approx([0.9 / 4, 1.5 / 4, 0.5 / 2])
     assert features[0] == pytest.approx(np.array([[0.5, 0.9, 0], [0, 1.5, 0.5], [0, 0, 0.5]])
-                                        / np.array([[np.hypot(0.5, 0.9)], [np.hypot(1.5, 0.5)], [0.5]]))  # fmt: skip
+                                        / np.array([[np.hypot(0.5, 0.9)], [np.hypot(1.5, 0.5)],
+                                                    [0.5]]))  # fmt: skip
 
 
 def test_a_cell_without_a_label_or_without_confidence_is_taught_nothing():

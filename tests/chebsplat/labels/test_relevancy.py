@@ -38,7 +38,8 @@ def test_a_place_without_features_is_relevant_to_nothing(sample):
 
 @pytest.mark.parametrize(
     ("query", "against", "temperature"),
-    [(np.ones(4), np.ones((2, 5)), 0.1), (np.ones(5), np.ones((0, 5)), 0.1), (np.ones(5), np.ones(5), 0.1),
+    [(np.ones(4), np.ones((2, 5)), 0.1), (np.ones(5), np.ones((0, 5)), 0.1),
+     (np.ones(5), np.ones(5), 0.1),
      (np.ones(5), np.ones((2, 5)), 0.0)],
 )  # fmt: skip
 def test_what_does_not_fit_is_an_error(query, against, temperature):

@@ -13,7 +13,8 @@ VOLUMES = [prism(SQUARE / 2, 0.5, 1.0), prism(SQUARE, 0.0, 1.0),
 @pytest.mark.parametrize(
     ("point", "held"),
     [
-        ((1.5, 1.5, 0.5), 1), ((0.5, 0.5, 0.75), 0), ((1.04, 0.5, 0.75), 1), ((2.02, 1, 0.5), 1), ((2.08, 1, 0.5), 2),
+        ((1.5, 1.5, 0.5), 1), ((0.5, 0.5, 0.75), 0), ((1.04, 0.5, 0.75), 1), ((2.02, 1, 0.5), 1),
+        ((2.08, 1, 0.5), 2),
         ((1, 1, -0.05), 1), ((1, 1, -0.07), -1), ((-0.05, -0.05, 0.2), 1), ((np.nan, 1, 0.5), -1),
     ],
 )  # fmt: skip
@@ -30,8 +31,10 @@ def test_a_triangle_holds_the_share_of_its_box_that_it_fills():
 @pytest.mark.parametrize(
     ("corners", "bottom", "top", "why"),
     [
-        (SQUARE, 1.0, 1.0, "no volume"), (SQUARE, 1.0, 0.0, "no volume"), (SQUARE[:2], 0.0, 1.0, "no volume"),
-        (SQUARE * [1, 0], 0.0, 1.0, "no volume"), ([*SQUARE.tolist(), [0.5, 1]], 0.0, 1.0, "not convex"),
+        (SQUARE, 1.0, 1.0, "no volume"), (SQUARE, 1.0, 0.0, "no volume"),
+        (SQUARE[:2], 0.0, 1.0, "no volume"),
+        (SQUARE * [1, 0], 0.0, 1.0, "no volume"),
+        ([*SQUARE.tolist(), [0.5, 1]], 0.0, 1.0, "not convex"),
     ],
 )  # fmt: skip
 def test_what_is_flat_or_not_convex_is_refused(corners, bottom, top, why):

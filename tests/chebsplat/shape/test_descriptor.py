@@ -79,7 +79,8 @@ def test_signs_of_the_principal_axes_change_no_bit(route):
 @pytest.mark.parametrize("before", ["padding", "broken"])
 def test_padding_and_broken_gaussians_are_zero_and_leave_the_rest_alone(route, n, before):
     whole = region(20)
-    padded = [torch.cat([torch.full_like(v[:, :5], torch.nan), v[:, :n], torch.full_like(v, 7.0)], 1)
+    padded = [torch.cat([torch.full_like(v[:, :5], torch.nan), v[:, :n], torch.full_like(v, 7.0)],
+                        1)
               for v in whole[:3]]  # fmt: skip
     place = torch.arange(25 + n)
     present = (place < n + 5) & ((place >= 5) | (before == "broken"))

@@ -198,7 +198,9 @@ def test_it_learns_what_shape_tells(seen):
     torch.manual_seed(0)
     encoder = PointEncoder(5, first.cloud.descriptors.shape[1])
     encoder.set_inputs([first.cloud], sample=1)
-    losses = list(point_encoder.taught(encoder, [first], point_encoder.Course(steps=60, batch=128)))
+    losses = list(
+        point_encoder.train_encoder(encoder, [first], point_encoder.Course(steps=60, batch=128))
+    )
     assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:3])
     of_room = summed(encoder.eval().encode(seen), codes[first.labels], np.ones(len(first.labels)))
     for answers in (

@@ -77,7 +77,8 @@ def bilinear(image, x, y):
 
 def test_fields_have_the_shapes_and_types_of_a_capture(toy):
     n, h, w = toy["depth"].shape
-    expected = {"images": ("uint8", (n, h, w, 3)), "depth": ("float32", (n, h, w)), "labels": ("int16", (n, h, w)),
+    expected = {"images": ("uint8", (n, h, w, 3)), "depth": ("float32", (n, h, w)),
+                "labels": ("int16", (n, h, w)),
                 "Ks": ("float64", (n, 3, 3)), "cam_from_world": ("float64", (n, 4, 4))}  # fmt: skip
     assert {name: (str(toy[name].dtype), toy[name].shape) for name in expected} == expected
     assert toy["names"][:2] == ["view_000", "view_001"]

@@ -152,7 +152,7 @@ def test_tables_that_do_not_fit_their_study_are_refused(changes, message):
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("cli")
-def test_the_papers_tables_run_whole_on_stand_ins_with_protocol_split_and_resolution_beside_each_figure(
+def test_the_papers_tables_run_on_stand_ins_with_protocol_split_and_resolution_by_each_figure(
     tmp_path, stand_ins
 ):
     (tmp_path / "mine.toml").write_text("""

@@ -32,8 +32,9 @@ from chebsplat.pipelines.studies.study import (
     read_study,
 )
 from chebsplat.pipelines.studies.tables import Section, sections
-from chebsplat.pipelines.work.scenes import data_of, names
+from chebsplat.pipelines.work.scenes import data_of, names, read_toml
 from chebsplat.stages.registry import STAGES
+from chebsplat.stages.runtime.config import build
 
 
 @pytest.fixture(autouse=True)
@@ -273,7 +274,7 @@ def test_a_study_of_one_machine_bewares_of_nothing(tmp_path):
     assert "C, 2 threads" in page and "beware" not in page
 
 
-def test_scannet_opens_scenes_are_summed_and_those_of_scannet_closed_averaged_before_seeds_are_compared(
+def test_scannet_open_sums_its_scenes_and_scannet_closed_averages_before_seeds_are_compared(
     tmp_path,
 ):
     # truth and prediction of wall and floor, in pixels           alone            summed, as
@@ -512,13 +513,49 @@ def test_every_study_of_ours_can_be_planned(name):
     assert {run.variant for run in runs} == set(found.variants)
 
 
+# Variants that are a method or a recipe of their own, not another but for one thing.
+METHODS = {"full", "default", "paper", "features-only", "plain", "classic", "published"}
+# and those that differ from one of these in several settings that are one thing, their name
+TOGETHER = {
+    "classic-alone": {"refine.start", "refine.smooth", "knowledge.start"},  # nothing after training
+    "plain, no cap": {"train.max_gaussians", "train.grow_threshold"},  # as far as the published
+}
+
+
+def chosen(variant):
+    """Every setting of a variant by section.key."""
+    variant = dict(variant)
+    ablation = variant.pop("ablation", "")
+    config = build(
+        plan.merged(read_toml("ablations", ablation) if ablation else {}, variant), "variant"
+    )
+    return {f"{s}.{k}": v for s, of in config.model_dump().items() for k, v in of.items()}
+
+
+@pytest.mark.parametrize("name", names("studies"))
+def test_a_variant_differs_from_another_in_the_one_thing_that_it_is_called_for(name):
+    found = read_study(name)
+    whole = [{}, *({"ablation": ablation} for ablation in ("plain", "classic"))]
+    for variant, values in found.variants.items():
+        if variant in METHODS:
+            assert values in ({}, {"ablation": variant}), variant
+            continue
+        others = [of for other, of in found.variants.items() if other != variant]
+        apart = [
+            {key for key, value in chosen(values).items() if chosen(of)[key] != value}
+            for of in (*others, *whole)
+        ]
+        wanted = TOGETHER.get(variant)
+        assert wanted in apart if wanted else any(len(keys) == 1 for keys in apart), variant
+
+
 def test_a_study_that_extends_another_has_its_values_but_for_its_own_and_names_what_it_takes():
     base = read_study("parts")
-    own = {"extends": "parts", "title": "T", "seeds": [7], "variants": ["no-ash", "features-only"]}
+    own = {"extends": "parts", "title": "T", "seeds": [7], "variants": ["no-ash", "full"]}
     found = checked_study(own, "mine")
     assert (found.title, found.seeds) == ("T", [7])
     assert (found.about, found.scenes, found.budgets) == (base.about, base.scenes, base.budgets)
-    assert found.variants == {name: base.variants[name] for name in ("no-ash", "features-only")}
+    assert found.variants == {name: base.variants[name] for name in ("no-ash", "full")}
 
 
 @pytest.mark.parametrize(
@@ -528,7 +565,7 @@ def test_a_study_that_extends_another_has_its_values_but_for_its_own_and_names_w
         ({"extends": "method-long"}, "mine: method-long itself extends parts; extend that"),
         ({"variants": ["full", "half"]}, "mine: variants: 'half' is none of full, features-only"),
         ({"conditions": ["noise"]}, "mine: conditions: 'noise' is none of"),
-        ({"variants": ["full"]}, "'features-only' is none of its variants"),
+        ({"variants": ["plain"]}, "'full' is none of its variants"),
     ],
 )
 def test_an_extension_of_what_is_not_there_is_an_error_that_names_it(changes, message):

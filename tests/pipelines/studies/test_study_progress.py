@@ -7,7 +7,7 @@ import pytest
 
 from chebsplat.errors import DataFailure
 from chebsplat.pipelines.studies import study
-from chebsplat.pipelines.studies.study import reported
+from chebsplat.pipelines.studies.study import report_progress
 
 
 @pytest.fixture
@@ -24,9 +24,9 @@ def finish(run):
 def test_every_run_is_told_once_when_it_is_done(runs):
     told = []
     finish(runs[0])
-    with reported(runs, told.append):  # the first was there before
+    with report_progress(runs, told.append):  # the first was there before
         finish(runs[1])
-    with reported(runs, told.append):
+    with report_progress(runs, told.append):
         finish(runs[2])
     assert told == ["  2 of 3 done: run-1", "  3 of 3 done: run-2"]
 
@@ -42,7 +42,7 @@ def test_what_shows_the_runs_is_written_while_they_go_on_and_a_failure_of_that_i
         written.set()
         raise DataFailure("no room")
 
-    with reported(runs, told.append, refresh):
+    with report_progress(runs, told.append, refresh):
         assert not written.wait(0.2)  # nothing new
         finish(runs[0])
         assert written.wait(20)

@@ -57,7 +57,8 @@ def cloud_of(wall):
     means = np.random.default_rng(1).uniform([-0.3, -0.3, 2.5], [0.3, 0.3, 4.0], (20, 3))
     return {
         "names": [str(k) for k in range(5)], "Ks": Ks, "cam_from_world": poses, "means": means,
-        "colors": np.zeros((20, 3), np.uint8), "seen_from": np.zeros(20, int), "tracks": np.zeros((0, 2), np.int32),
+        "colors": np.zeros((20, 3), np.uint8), "seen_from": np.zeros(20, int),
+        "tracks": np.zeros((0, 2), np.int32),
         "notes": {},
     }  # fmt: skip
 

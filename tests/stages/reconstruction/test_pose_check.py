@@ -12,7 +12,9 @@ from chebsplat.cameras import centers
 from chebsplat.photos.guided import fundamental, sampson_distance
 from chebsplat.stages.reconstruction import pose_check
 from chebsplat.stages.settings import SfmSection
-from tests.stages.reconstruction.test_adjustment import poses_of, synthetic  # noqa: F401 the fixture
+
+# synthetic is a fixture
+from tests.stages.reconstruction.test_adjustment import poses_of, synthetic  # noqa: F401
 
 K = np.array([[900.0, 0, 512], [0, 900, 384], [0, 0, 1]])
 

@@ -24,8 +24,10 @@ from chebsplat.stages.sources.cameras import FACES, Camera
 from chebsplat.stages.sources.common import Frame, Listing
 
 GOOD = {
-    "n_registered": 20, "n_given": 20, "n_in_others": [], "n_misplaced": 0, "n_points": 4000, "points_a_view": 400.0,
-    "track_length": 4.0, "reprojection_error_px": 0.5, "reprojection_error": 4e-4, "mapped_error": 5e-4,
+    "n_registered": 20, "n_given": 20, "n_in_others": [], "n_misplaced": 0, "n_points": 4000,
+    "points_a_view": 400.0,
+    "track_length": 4.0, "reprojection_error_px": 0.5, "reprojection_error": 4e-4,
+    "mapped_error": 5e-4,
     "pairs_agree": 0.95, "pairs_level": 0.1, "angle_degrees": 15.0,
 }  # fmt: skip
 
@@ -90,7 +92,8 @@ def test_what_speaks_against_a_model_is_said(changed, said):
 )
 def test_a_model_that_is_not_to_be_believed_is_refused(n, changed, said):
     none = np.zeros((0, 3))
-    model = PhotoModel(["a"] * n, [], np.zeros(n), np.zeros((n, 4, 4)), none, none, none[:, 0], none[:, :2],
+    model = PhotoModel(["a"] * n, [], np.zeros(n), np.zeros((n, 4, 4)), none, none, none[:, 0],
+                       none[:, :2],
                        judged=GOOD | changed | {"doubts": []})  # fmt: skip
     with pytest.raises(DataFailure, match=said):
         judge.check(model, 0.5)
@@ -224,8 +227,11 @@ def test_poses_and_the_lens_of_photos_are_found_and_what_it_bends_is_undone(tmp_
     assert run_stage("ingest", tmp_path / "capture", {"model": tmp_path / "model"}, config) == 0
     capture = Capture.read(tmp_path / "capture")
     assert capture.points is not None and len(capture.tracks) > len(capture.points)
-    given = {frame["file_path"].split("/")[-1].split(".")[0]: np.array(frame["transform_matrix"])
-             for frame in json.loads((data("fox") / "transforms.json").read_text())["frames"]}  # fmt: skip
+    frames = json.loads((data("fox") / "transforms.json").read_text())["frames"]
+    given = {
+        frame["file_path"].split("/")[-1].split(".")[0]: np.array(frame["transform_matrix"])
+        for frame in frames
+    }
     true = np.linalg.inv(
         np.stack([given[name] @ np.diag([1, -1, -1, 1]) for name in capture.names])
     )

@@ -105,7 +105,8 @@ def test_an_even_part_of_what_follows_colours_is_found_again():
     nothing = np.zeros((len(found["means"]), 3), np.float32)
     shapes = np.zeros((len(nothing), 3, 3), np.float32)
     given = Points(
-        [], np.zeros((0, 3, 3)), np.zeros((0, 4, 4)), found["means"], found["colors"], nothing, shapes,
+        [], np.zeros((0, 3, 3)), np.zeros((0, 4, 4)), found["means"], found["colors"], nothing,
+        shapes,
         found["tracks"], found["notes"],
     )  # fmt: skip
     rows = even(given)
@@ -137,7 +138,8 @@ def test_gaussians_start_surer_where_depth_is_measured(notes, opacity):
     shapes = np.tile(np.eye(3, dtype=np.float32), (50, 1, 1))
     nothing = np.zeros((0, 2), np.int32)
     given = Points(
-        ["a"], np.zeros((1, 3, 3)), np.zeros((1, 4, 4)), places, colors, np.zeros((50, 3)), shapes, nothing, notes
+        ["a"], np.zeros((1, 3, 3)), np.zeros((1, 4, 4)), places, colors, np.zeros((50, 3)), shapes,
+        nothing, notes
     )  # fmt: skip
     config = Config()
     capture = SimpleNamespace(

@@ -50,7 +50,7 @@ def test_without_the_extra_a_heic_photo_is_one_line_that_installs_it(tmp_path, m
     (tmp_path / "a.heic").write_bytes(HEADER)
     for read in (images.header, images.read_rgb, lambda path: media_packages([path])):
         with pytest.raises(
-            InputError, match=r"a\.heic is a HEIC photo.*pip install -e '\.\[heic\]'"
+            InputError, match=r"a\.heic is a HEIC photo, which needs the extra `heic`: .*\[heic\]"
         ) as raised:
             read(tmp_path / "a.heic")
         assert raised.value.exit_code == 3 and "\n" not in str(raised.value)
@@ -110,7 +110,8 @@ def test_blurred_photos_are_counted_and_named():
 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "kind", "least", "most"), [("redkitchen", "seven_scenes", 8, 16),
-                                                             ("house_kitchen", "colmap", 0, 0)])  # fmt: skip
+                                                             ("house_kitchen", "colmap", 0,
+                                                              0)])  # fmt: skip
 def test_a_hand_held_sensor_has_blurred_frames_and_a_rendered_house_none(name, kind, least, most):
     fields = ingest.read(name, SourceSection(kind=kind, path=str(data(name))), IngestSection())
     n = int((ingest.blur_note(fields) or "0").split()[0])

@@ -62,41 +62,31 @@ WAYS = {
     "ids with names": (pictures(ONE), BY_ID, NAMES, "taken for ids with names: 3 classes"),
     "16 bits": (pictures(ONE, np.uint16), BY_ID, NAMES, "taken for ids with names"),
     "a palette": (palette, BY_ID, NAMES, "taken for ids with names"),
-    "an ending in capitals": (pictures(ONE, ending=".PNG"), BY_ID, NAMES, "taken for ids with names"),
+    "an ending in capitals": (pictures(ONE, ending=".PNG"), BY_ID, NAMES,
+                              "taken for ids with names"),
     "a PNG called .jpg": (pictures(ONE, ending=".jpg"), BY_ID, NAMES, "taken for ids with names"),
     "an array": (arrays(ONE, np.uint8), BY_ID, NAMES, "taken for ids with names"),
     "an array of floats": (arrays(ONE, np.float32), BY_ID, NAMES, "taken for ids with names"),
     "an array with -1": (arrays([0, 1, 2, -1]), BY_PLACE, NAMES, "with names"),
-    "names spelt in two ways": (pictures([1, 2, 3, 9]), BY_ID | {"9": " VOID "}, NAMES, "called VOID are "
-                                                                                        ""
-                                                                                        ""
-                                                                                        "void"),
-    "ids without names": (pictures(ONE), None, ["class_1", "class_2", "class_3"], r"no names.*; 0 \(\d.*none "
-                                                                                  r""
-                                                                                  r""
-                                                                                  r"of"),
-    "255 for void": (pictures(ZERO), None, UNNAMED, r"255 \(\d.* is taken for void, and 0 for a "
-                                                    r"class"),
-    "65535 for void": (pictures(CODE, np.uint16), None, UNNAMED, r"65535 \(\d.* is taken for void, and 0 for a "
-                                                                 r""
-                                                                 r""
-                                                                 r"class"),
-    "255 without a name": (pictures(ZERO), BY_PLACE, NAMES, r"without a name are ignored: 255 \(\d"),
+    "names spelt in two ways": (pictures([1, 2, 3, 9]), BY_ID | {"9": " VOID "}, NAMES,
+                                "called VOID are void"),
+    "ids without names": (pictures(ONE), None, ["class_1", "class_2", "class_3"],
+                          r"no names.*; 0 \(\d.*none of"),
+    "255 for void": (pictures(ZERO), None, UNNAMED,
+                     r"255 \(\d.* is taken for void, and 0 for a class"),
+    "65535 for void": (pictures(CODE, np.uint16), None, UNNAMED,
+                       r"65535 \(\d.* is taken for void, and 0 for a class"),
+    "255 without a name": (pictures(ZERO), BY_PLACE, NAMES,
+                           r"without a name are ignored: 255 \(\d"),
     "colours": (pictures(RGB), None, HEX, r"taken for colours without names.*#000000 \(\d"),
-    "colours with names": (pictures(RGB), dict(zip(HEX, NAMES, strict=True)), NAMES, "taken for colours with "
-                                                                                     ""
-                                                                                     ""
-                                                                                     "names"),
+    "colours with names": (pictures(RGB), dict(zip(HEX, NAMES, strict=True)), NAMES,
+                           "taken for colours with names"),
     "transparent colours": (pictures(CLEAR), None, HEX, "taken for colours without names"),
     "grey colours": (pictures(GREY), BY_ID, NAMES, "taken for ids with names"),
-    "scores, classes last": (arrays(SCORES, np.float32), BY_PLACE, NAMES, "taken for scores by class with "
-                                                                          ""
-                                                                          ""
-                                                                          "names"),
-    "scores, classes first": (arrays(SCORES, np.float32, FIRST), None, UNNAMED, "scores by class without "
-                                                                                ""
-                                                                                ""
-                                                                                "names"),
+    "scores, classes last": (arrays(SCORES, np.float32), BY_PLACE, NAMES,
+                             "taken for scores by class with names"),
+    "scores, classes first": (arrays(SCORES, np.float32, FIRST), None, UNNAMED,
+                              "scores by class without names"),
     "one-hot": (arrays(SCORES, bool, FIRST), BY_PLACE, NAMES, "taken for scores by class"),
     "masks of a view": (masks(NAMES), None, NAMES, "taken for one mask a class"),
     "masks of a view as JPEG": (masks(NAMES, "jpg"), None, NAMES, "taken for one mask a class"),
@@ -145,8 +135,10 @@ def test_masks_in_folders_of_classes_are_told_from_ids_whatever_classes_a_view_s
 
 @pytest.mark.parametrize(
     ("present", "code"),
-    [([0, 1, 2, 255], 255), ([0, 1, 65_535], 65_535), ([1, 2, 4, 5, 255], 255), ([0, 2, 3, 40, 255], None),
-     ([0, 255], None), ([0, 51, 102, 153, 204, 255], None), (list(range(256)), None), ([0, 1, 2], None),
+    [([0, 1, 2, 255], 255), ([0, 1, 65_535], 65_535), ([1, 2, 4, 5, 255], 255),
+     ([0, 2, 3, 40, 255], None),
+     ([0, 255], None), ([0, 51, 102, 153, 204, 255], None), (list(range(256)), None),
+     ([0, 1, 2], None),
      ([0, 1, 2, 254, 255], None), ([255], None), ([], None), ([0, 1, 255, 65_535], None)],
 )  # fmt: skip
 def test_which_of_ids_without_names_is_void(present, code):
@@ -155,10 +147,13 @@ def test_which_of_ids_without_names_is_void(present, code):
 
 @pytest.mark.parametrize(
     ("name", "which", "void"),
-    [(name, 5, True) for name in ("unannotated", "Unlabeled", "unlabelled", "ignore", "IGNORED ", "void", "un-defined",
+    [(name, 5, True) for name in ("unannotated", "Unlabeled", "unlabelled", "ignore", "IGNORED ",
+                                  "void", "un-defined",
                                   "none", "No Label", "not_labeled", "unknown")]
-    + [("background", 0, True), ("Background", 255, True), ("background", 7, False), ("#background", 255, False)]
-    + [(name, 0, False) for name in ("other", "others", "otherprop", "otherfurniture", "clutter", "wall", "void deck")],
+    + [("background", 0, True), ("Background", 255, True), ("background", 7, False),
+       ("#background", 255, False)]
+    + [(name, 0, False) for name in ("other", "others", "otherprop", "otherfurniture", "clutter",
+                                     "wall", "void deck")],
 )  # fmt: skip
 def test_names_of_the_usual_sets_that_mean_nothing_are_void_and_classes_are_not(name, which, void):
     kind, name = (labels.COLORS, name[1:]) if name[0] == "#" else (labels.IDS, name)
@@ -187,7 +182,8 @@ def test_maps_lie_in_folders_of_other_names_and_beside_a_transforms_json(tmp_pat
 
 @pytest.mark.parametrize("place", ["", "left/", "Left/"])
 def test_maps_lie_in_the_folders_of_their_photos_or_in_fewer(tmp_path, place):
-    folder = source(tmp_path, lambda path, classes: pictures(ONE)(path.parent / place / path.name, classes), BY_ID,
+    folder = source(tmp_path, lambda path,
+                    classes: pictures(ONE)(path.parent / place / path.name, classes), BY_ID,
                     inner="left/")  # fmt: skip
     check(colmap.read(folder, SETTINGS), NAMES)
 

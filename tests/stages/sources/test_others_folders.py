@@ -20,7 +20,8 @@ LARGE = IngestSection(max_side=640, min_views=2)
     {"left\\a.png": "left/a.png", "left\\b.png": "left/b.png", "right\\a.png": "right/a.png"},
     {"images/a.png": "a.png", "images/b.png": "b.png", "images/c.png": "c.png"},
     {"a.png": "2024/a.jpg", "b.png": "2024/b.jpg", "c.png": "2024/c.jpg"},
-    {"data/cam1/a.tif": "cam1/a.jpg", "data/cam2/a.tif": "cam2/a.jpg", "data/cam2/b.tif": "cam2/b.jpg"},
+    {"data/cam1/a.tif": "cam1/a.jpg", "data/cam2/a.tif": "cam2/a.jpg",
+     "data/cam2/b.tif": "cam2/b.jpg"},
     {"IMG.1.png": "IMG.1.JPG", "IMG.2.png": "IMG.2.JPG", "IMG.3.png": "IMG.3.JPG"},
 ])  # fmt: skip
 @pytest.mark.parametrize("form", ["bin", "txt"])

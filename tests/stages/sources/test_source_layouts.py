@@ -42,7 +42,8 @@ def with_classes(scene, names):
     """The scene with its k-th class called by the (k + 7)-th of `names`, so that shelves and
     counter are among them.
     """
-    return scene | {"labels": np.where(scene["labels"] < 0, -1, (scene["labels"] + 7) % len(names)).astype(np.int16),
+    return scene | {"labels": np.where(scene["labels"] < 0, -1,
+                                       (scene["labels"] + 7) % len(names)).astype(np.int16),
                     "class_names": list(names)}  # fmt: skip
 
 

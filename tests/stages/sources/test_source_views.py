@@ -117,8 +117,10 @@ KEYPOINTS = "3 4 -1 5 6 -1 7 8 1 2 3 -1"  # 12 numbers: more words than an image
 
 
 @pytest.mark.parametrize("between", [
-    ["", "", ""], [KEYPOINTS] * 3, ["", KEYPOINTS, ""], [None] * 3, [None, KEYPOINTS, None], ["# 3 keypoints"] * 3,
-    [" # none", "", "  "], [f"# of a\n{KEYPOINTS}", "#", KEYPOINTS], ["1.5 2.5 -1\n\n # end", "\n", None],
+    ["", "", ""], [KEYPOINTS] * 3, ["", KEYPOINTS, ""], [None] * 3, [None, KEYPOINTS, None],
+    ["# 3 keypoints"] * 3,
+    [" # none", "", "  "], [f"# of a\n{KEYPOINTS}", "#", KEYPOINTS],
+    ["1.5 2.5 -1\n\n # end", "\n", None],
 ])  # fmt: skip
 def test_no_view_of_a_text_model_is_lost_whatever_follows_it(tmp_path, between):
     """Keypoints, an empty line, a comment, or nothing at all, as scripts that thin out a model
@@ -164,7 +166,8 @@ LENSES = {
     "THIN_PRISM_FISHEYE": [200, 210, 120, 90] + [0.01] * 8,
     "RAD_TAN_THIN_PRISM_FISHEYE": [200, 210, 120, 90] + [0.001] * 12,
     "SIMPLE_DIVISION": [200, 120, 90, -0.1], "DIVISION": [200, 210, 120, 90, -0.1],
-    "SIMPLE_FISHEYE": [200, 120, 90], "FISHEYE": [200, 210, 120, 90], "EUCM": [200, 210, 120, 90, 0.6, 1.1],
+    "SIMPLE_FISHEYE": [200, 120, 90], "FISHEYE": [200, 210, 120, 90],
+    "EUCM": [200, 210, 120, 90, 0.6, 1.1],
 }  # fmt: skip
 
 
@@ -315,10 +318,8 @@ def test_undistortion_follows_the_polynomial_for_images_depth_and_labels(tmp_pat
     assert (ids == np.floor(at_y / 20) + 1)[inner][whole[inner]].all()
 
 
-STRAIGHT = ["SIMPLE_RADIAL 80 60 50 40.3 29.6 0", "RADIAL 80 60 50 40 30 0 0", "OPENCV 80 60 50 51 40 30 0 0 0 "
-                                                                               ""
-                                                                               ""
-                                                                               "0",
+STRAIGHT = ["SIMPLE_RADIAL 80 60 50 40.3 29.6 0", "RADIAL 80 60 50 40 30 0 0",
+            "OPENCV 80 60 50 51 40 30 0 0 0 0",
             "OPENCV 80 60 50 50 40 30 1e-5 -2e-5 1e-6 0"]  # fmt: skip
 
 

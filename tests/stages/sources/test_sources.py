@@ -64,7 +64,9 @@ def test_fox_lists_absent_frames_and_is_undistorted():
     assert fields["images"].shape[0] == 50 and max(fields["images"].shape[1:3]) == 64
     assert any("17 of 67" in note for note in fields["source"]["notes"])
     assert any("undistorted" in note for note in fields["source"]["notes"])
-    assert np.allclose(fields["Ks"][:, 0, 0] / 64, 1375.52 / 1920, rtol=0.05)
+    assert np.allclose(
+        fields["Ks"][:, 0, 0] / 64, 1375.52 / 1920, rtol=0.02
+    )  # what was bent is cut off
 
 
 @pytest.mark.data
@@ -159,11 +161,15 @@ def test_probes_of_a_thousand_frames_open_no_picture(tmp_path, monkeypatch):
     }
     pixels = image(tmp_path / "x.png").read_bytes()
     (tmp_path / "x.png").unlink()
-    for part in ("slam/results/frame{:06d}.jpg", "slam/results/depth{:06d}.png", "nerf/Sequence_1/rgb/rgb_{}.png",
-                 "nerf/Sequence_1/depth/depth_{}.png", "nerf/Sequence_1/semantic_class/semantic_class_{}.png",
-                 "colmap/images/{}.png", "colmap/depth/{}.png", "colmap/semantic/{}.png", "photos/{}.png",
+    for part in ("slam/results/frame{:06d}.jpg", "slam/results/depth{:06d}.png",
+                 "nerf/Sequence_1/rgb/rgb_{}.png",
+                 "nerf/Sequence_1/depth/depth_{}.png",
+                 "nerf/Sequence_1/semantic_class/semantic_class_{}.png",
+                 "colmap/images/{}.png", "colmap/depth/{}.png", "colmap/semantic/{}.png",
+                 "photos/{}.png",
                  "transforms/images/{}.png", "scannet/color/{}.png", "scannet/label-filt/{}.png",
-                 "scannet/depth/{}.png", "seven/frame-{:06d}.color.png", "seven/frame-{:06d}.depth.png",
+                 "scannet/depth/{}.png", "seven/frame-{:06d}.color.png",
+                 "seven/frame-{:06d}.depth.png",
                  "seven/frame-{:06d}.pose.txt"):  # fmt: skip
         (tmp_path / part).parent.mkdir(parents=True, exist_ok=True)
         for k in range(1000):
@@ -175,7 +181,8 @@ def test_probes_of_a_thousand_frames_open_no_picture(tmp_path, monkeypatch):
     (folders["transforms"] / "transforms.json").write_text(
         json.dumps({"fl_x": 1.0, "frames": frames})
     )
-    modules = {"slam": replica, "nerf": replica, "colmap": colmap, "transforms": transforms, "photos": photos,
+    modules = {"slam": replica, "nerf": replica, "colmap": colmap, "transforms": transforms,
+               "photos": photos,
                "scannet": scannet, "seven": seven_scenes}  # fmt: skip
     monkeypatch.setattr("PIL.Image.open", lambda *_, **__: pytest.fail("a probe opened a picture"))
     for kind, module in modules.items():

@@ -21,9 +21,11 @@ BROWN = [200, 210, 120, 90, -0.2, 0.05, 0.001, 0.002, 0.01, 0, 0, 0]
     (LENS | {"k3": 0.01}, "FULL_OPENCV", BROWN),
     ({"distortion_params": [-0.2, 0.05, 0.01, 0, 0.001, 0.002]}, "FULL_OPENCV", BROWN),
     ({"distortion_params": [-0.2, 0.05, 0, 0, 0.001, 0.002], "k1": 9}, "OPENCV", BROWN[:8]),
-    (LENS | {"k3": 0.01, "k4": 0.02, "k5": 0.03, "k6": 0.004, "camera_model": "FULL_OPENCV"}, "FULL_OPENCV",
+    (LENS | {"k3": 0.01, "k4": 0.02, "k5": 0.03, "k6": 0.004, "camera_model": "FULL_OPENCV"},
+     "FULL_OPENCV",
      [*BROWN[:9], 0.02, 0.03, 0.004]),
-    ({"k1": 0.01, "k2": 0.002, "k3": 0.001, "k4": 1e-4, "camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE",
+    ({"k1": 0.01, "k2": 0.002, "k3": 0.001, "k4": 1e-4, "camera_model": "OPENCV_FISHEYE"},
+     "OPENCV_FISHEYE",
      [200, 210, 120, 90, 0.01, 0.002, 0.001, 1e-4]),
     ({"k1": 0.01, "is_fisheye": True}, "OPENCV_FISHEYE", [200, 210, 120, 90, 0.01, 0, 0, 0]),
 ])  # fmt: skip
@@ -52,7 +54,8 @@ def test_every_lens_that_can_be_written_is_undone(tmp_path, values, model, param
 @pytest.mark.parametrize(("lists", "tests", "names"), [
     ({"train_filenames": [0, 1], "val_filenames": [2], "test_filenames": [2]}, [2], [0, 1, 2]),
     ({"train_filenames": [0], "val_filenames": [1], "test_filenames": [3]}, [1, 3], [0, 1, 3]),
-    ({"train_filenames": [0, 2]}, [1, 3], [0, 1, 2, 3]), ({"test_filenames": [1]}, [1], [0, 1, 2, 3]),
+    ({"train_filenames": [0, 2]}, [1, 3], [0, 1, 2, 3]),
+    ({"test_filenames": [1]}, [1], [0, 1, 2, 3]),
 ])  # fmt: skip
 def test_lists_of_nerfstudio_are_the_split(tmp_path, lists, tests, names):
     paths = [f"images/frame_{k + 9}.png" for k in range(4)]

@@ -146,7 +146,7 @@ def test_without_the_extra_a_video_is_one_line_that_installs_it(tmp_path, monkey
     (tmp_path / "a.mp4").write_bytes(b"\0")
     for read in (videos.describe, lambda path: media_packages([path])):
         with pytest.raises(
-            InputError, match=r"a\.mp4 is a video.*pip install -e '\.\[video\]'"
+            InputError, match=r"a\.mp4 is a video, which needs the extra `video`: .*\[video\]"
         ) as raised:
             read(tmp_path / "a.mp4")
         assert raised.value.exit_code == 3 and "\n" not in str(raised.value)

@@ -53,10 +53,8 @@ VOLUME = WHOLE["volumes"][0]
 @pytest.mark.parametrize(
     ("changed", "word"),
     [
-        ({"frame": np.eye(3).tolist()}, "its frame and margin"), ({"margin": "2 cm"}, "its frame and "
-                                                                                      ""
-                                                                                      ""
-                                                                                      "margin"),
+        ({"frame": np.eye(3).tolist()}, "its frame and margin"),
+        ({"margin": "2 cm"}, "its frame and margin"),
         ({"volumes": [VOLUME, {"name": "x", "height": [0, 1]}]}, r"volume 1: 'polygon'"),
         ({"volumes": [VOLUME | {"height": [1, 0]}]}, "volume 0: holds no volume"),
         ({"volumes": [VOLUME | {"height": 1}]}, "volume 0"),

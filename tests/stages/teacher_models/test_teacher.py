@@ -44,8 +44,10 @@ def capture(tmp_path_factory):
 def published_capture(path, images, labels=None, class_names=tuple(COLORS)):
     n = len(images)
     record = Capture(
-        [f"view_{k:03d}" for k in range(n)], images, np.tile(np.eye(3), (n, 1, 1)), None, np.arange(n) % 4 == 0,
-        labels=None if labels is None else labels.astype(np.int16), class_names=list(class_names) or None,
+        [f"view_{k:03d}" for k in range(n)], images, np.tile(np.eye(3), (n, 1, 1)), None,
+        np.arange(n) % 4 == 0,
+        labels=None if labels is None else labels.astype(np.int16),
+        class_names=list(class_names) or None,
     )  # fmt: skip
     return published(path, record)
 
@@ -157,7 +159,9 @@ def test_channels_are_reduced_in_every_view_and_the_labels_are_the_teacher_s(tmp
     plain.mkdir()
     _, own = encoded(plain, capture, color_teacher(plain))
     assert np.array_equal(found.pseudo_labels[:], own.pseudo_labels[:])
-    assert np.allclose(found.features[:] @ found.label_embeddings.T, own.features[:] @ own.label_embeddings.T, atol=4e-3)  # fmt: skip  # noqa: E501
+    assert np.allclose(found.features[:] @ found.label_embeddings.T,
+                       own.features[:] @ own.label_embeddings.T,
+                       atol=4e-3)  # fmt: skip
 
 
 # labels
@@ -209,6 +213,28 @@ def test_classes_of_a_segmenter_that_mean_one_label_become_it(tmp_path, capture)
     assert (code, found.label_names) == (0, ["red", "sea"])
     file.write_text("sea: blu\n")
     assert encoded(tmp_path / "other", capture, tmp_path / "tiny.onnx", labels=str(file))[0] == 3
+
+
+@pytest.mark.parametrize(
+    ("classes", "labels", "names"),
+    [
+        ("red\ngreen\nsea", "", ["red", "green"]),  # a fifth of the pixels
+        ("Sky\nroad\nsea", "", ["Sky", "road", "sea"]),  # all are of outdoors: this is no room
+        ("red\ngreen\nsea", "sea: sea\n", ["red", "green", "sea"]),  # asked for
+        ("red\nblue\nsea", "blue: blue, sea\n", ["red", "blue"]),
+    ],
+)
+def test_classes_of_outdoors_are_left_out_of_a_room(tmp_path, classes, labels, names):
+    image, _ = painted(np.random.default_rng(0))
+    image[image[..., 2] > 128] = (255, 0, 0)
+    image[:6] = (0, 0, 255)
+    capture = published_capture(tmp_path / "room", image[None], class_names=())
+    (tmp_path / "labels.txt").write_text(labels)
+    asked = {"labels": str(tmp_path / "labels.txt")} if labels else {}
+    code, found = encoded(tmp_path, capture, segmenter(tmp_path, f"{classes}\n"), **asked)
+    assert (code, found.label_names) == (0, names)
+    assert found.confidence[:].min() > 0.4
+    assert (found.pseudo_labels[:] >= 0).all()
 
 
 def test_of_a_segmenter_whose_toml_says_no_output_the_labels_tell(tmp_path):

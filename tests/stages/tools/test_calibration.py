@@ -133,7 +133,8 @@ def toy_calibration(model, **changes):
     rivals = ["chair", "sofa", "wall", "object"]
     files.write_calibration(
         files.beside(model),
-        files.TeacherCalibration(**{"teacher": "toy", "sha256": sha256_file(model), "rivals": rivals,
+        files.TeacherCalibration(**{"teacher": "toy", "sha256": sha256_file(model),
+                                    "rivals": rivals,
                                     "calibration": OF._asdict(), "made": {}} | changes),
     )  # fmt: skip
 

@@ -125,7 +125,7 @@ def constants():
 def hub(constants, tmp_path, monkeypatch):
     """A hub that answers, an empty cache, and a small photo for the check."""
     photo = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
-    monkeypatch.setattr("chebsplat.stages.tools.get_teacher.shown", lambda _: ("photo", photo))
+    monkeypatch.setattr("chebsplat.stages.tools.get_teacher.read_photo", lambda _: ("photo", photo))
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("time.sleep", lambda _: None)  # where the client waits, and tries again
     monkeypatch.chdir(tmp_path)
@@ -156,25 +156,33 @@ def usual(v, m, s):
 FED = {
     "as usual": (NORM, usual, {"mean": [0.485, 0.456, 0.406]}),
     "said in full": (
-        NORM | {"do_rescale": True, "rescale_factor": 0.00392156862745098, "do_normalize": True, "do_pad": True},
+        NORM | {"do_rescale": True, "rescale_factor": 0.00392156862745098, "do_normalize": True,
+                "do_pad": True},
         usual, {},
     ),
     "not normalised": (NORM | {"do_normalize": False}, lambda v, m, s: v / 255, {"std": [1, 1, 1]}),
     "not rescaled": (
-        {"do_rescale": False, "image_mean": [123.675, 116.28, 103.53], "image_std": [58.395, 57.12, 57.375]},
+        {"do_rescale": False, "image_mean": [123.675, 116.28, 103.53],
+         "image_std": [58.395, 57.12, 57.375]},
         lambda v, m, s: (v - m) / s, {},
     ),
     "neither": ({"do_rescale": False, "do_normalize": False}, lambda v, m, s: v, {}),
-    "rescaled to 0 to 2": (NORM | {"rescale_factor": 1 / 127.5}, lambda v, m, s: (v / 127.5 - m) / s, {}),
-    "rescaled to less than 1": ({"rescale_factor": 1 / 256, "do_normalize": False}, lambda v, m, s: v / 256, {}),
-    "one number for three": ({"image_mean": 0.5, "image_std": 0.5}, lambda v, m, s: v / 127.5 - 1, {}),
+    "rescaled to 0 to 2": (NORM | {"rescale_factor": 1 / 127.5}, lambda v, m,
+                           s: (v / 127.5 - m) / s, {}),
+    "rescaled to less than 1": ({"rescale_factor": 1 / 256, "do_normalize": False}, lambda v, m,
+                                s: v / 256, {}),
+    "one number for three": ({"image_mean": 0.5, "image_std": 0.5}, lambda v, m, s: v / 127.5 - 1,
+                             {}),
     "BGR": ({"do_flip_channel_order": True}, lambda v, m, s: v[::-1] / 255, {"order": "BGR"}),
     "MobileViT, which is of BGR unless it says otherwise": (
-        {"image_processor_type": "MobileViTImageProcessor"}, lambda v, m, s: v[::-1] / 255, {"order": "BGR"},
+        {"image_processor_type": "MobileViTImageProcessor"}, lambda v, m, s: v[::-1] / 255,
+        {"order": "BGR"},
     ),
     "bicubic": (NORM | {"resample": 3}, usual, {"resample": "bicubic"}),
-    "the shortest edge": (NORM | {"size": {"shortest_edge": 96}}, usual, {"size": [96, 96], "base": 128}),
-    "the longest edge": (NORM | {"size": {"shortest_edge": 96, "longest_edge": 100}}, usual, {"base": 100}),
+    "the shortest edge": (NORM | {"size": {"shortest_edge": 96}}, usual,
+                          {"size": [96, 96], "base": 128}),
+    "the longest edge": (NORM | {"size": {"shortest_edge": 96, "longest_edge": 100}}, usual,
+                         {"base": 100}),
     "a crop": (
         NORM | {"size": {"shortest_edge": 96}, "do_center_crop": True, "crop_size": 64},
         usual, {"size": [64, 64], "base": 128},
@@ -241,7 +249,8 @@ def test_weights_beside_a_graph_come_along_and_count_in_its_checksum(tmp_path, m
     (held / "config.json").write_text(json.dumps({"id2label": dict(enumerate(CLASSES))}))
     (held / "preprocessor_config.json").write_text(json.dumps(PREPARATION))
     monkeypatch.setattr(
-        "chebsplat.stages.tools.get_teacher.fetched", lambda repository, file, revision: held / file
+        "chebsplat.stages.tools.get_teacher.fetch_file",
+        lambda repository, file, revision: held / file,
     )
     model, _ = get_teacher(NAME, tmp_path / "out")
     assert (tmp_path / "out/model.onnx_data").is_file()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
+from shared import data
 
 from chebsplat.formats.ply import read_ply, write_ply
 from chebsplat.pipelines.cli.uses import label
@@ -85,3 +86,11 @@ def test_a_splat_that_shows_no_surface_is_exit_4_and_nothing_is_overwritten(toy,
     done = run(box, "--words", "wall", "--knowledge", toy["teach"], "--out", box)
     assert done.exception.exit_code == 2
     assert "exists" in str(done.exception)
+
+
+def test_labels_of_what_is_no_room_come_with_a_warning(tmp_path, caplog):
+    guitar = data("gs_ply") / "guitar_decoded_sh0.ply"
+    done = run(guitar, "--words", "wall,floor,chair", "--out", tmp_path / "named.ply")
+    assert done.exit_code == 0, done.output
+    assert "not sure which way is up" in caplog.text
+    assert "do not rely on its labels" in caplog.text

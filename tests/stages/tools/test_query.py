@@ -1,6 +1,7 @@
 """`chebsplat query` finds what words mean in a finished scene, or says why it cannot."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,7 +22,8 @@ from chebsplat.pipelines.cli import main
 
 EMBEDDINGS = {
     "chair": [1, 0, 0, 0, 0, 0], "sofa": [0.8, 0.6, 0, 0, 0, 0], "wall": [0, 0, 1, 0, 0, 0],
-    "seat": [0.9, 0.4, 0, 0, 0.17, 0], "object": [0.3, 0, 0.3, 0.9, 0, 0], "things": [0, 0.3, 0.2, 0.9, 0, 0.2],
+    "seat": [0.9, 0.4, 0, 0, 0.17, 0], "object": [0.3, 0, 0.3, 0.9, 0, 0],
+    "things": [0, 0.3, 0.2, 0.9, 0, 0.2],
     "stuff": [0, 0, 0.3, 0.95, 0, 0], "texture": [0, 0, 0.5, 0.87, 0, 0],
 }  # fmt: skip
 LABELS = ["chair", "sofa", "wall"]
@@ -49,9 +51,12 @@ def write_toy(folder, teacher=None):
     known = vectors(LABELS) if teacher is None else channels.embed(vectors(LABELS))
     n = len(means)
     parameters = {
-        "means": means, "log_scales": np.full((n, 3), -1.6, np.float32), "quats": np.eye(4, dtype=np.float32)[[0] * n],
-        "logit_opacities": np.full(n, 4, np.float32), "sh0": rng.normal(0, 0.3, (n, 1, 3)).astype(np.float32),
-        "shN": np.zeros((n, 15, 3), np.float32), "degrees": np.zeros(n, np.uint8), "features": known[labels],
+        "means": means, "log_scales": np.full((n, 3), -1.6, np.float32),
+        "quats": np.eye(4, dtype=np.float32)[[0] * n],
+        "logit_opacities": np.full(n, 4, np.float32),
+        "sh0": rng.normal(0, 0.3, (n, 1, 3)).astype(np.float32),
+        "shN": np.zeros((n, 15, 3), np.float32), "degrees": np.zeros(n, np.uint8),
+        "features": known[labels],
     }  # fmt: skip
     K = np.array([[40, 0, SIZE[1] / 2], [0, 40, SIZE[0] / 2], [0, 0, 1]], float)
     views, Ks, poses = ["a.png", "b.png"], np.stack([K, K]), np.stack([np.eye(4)] * 2)
@@ -68,7 +73,8 @@ def write_toy(folder, teacher=None):
             str(teacher),
         )
     features = Features(
-        views, np.zeros((2, 2, 2, known.shape[1]), np.float16), LABELS, known, convention=convention,
+        views, np.zeros((2, 2, 2, known.shape[1]), np.float16), LABELS, known,
+        convention=convention,
         channels=None if teacher is None else channels,
     )  # fmt: skip
     published(folder / "teacher", features, config={"teacher": {"model": model}})
@@ -112,6 +118,8 @@ def test_a_word_is_found_in_the_scene_and_drawn_by_render(folder, tmp_path):
     command = [
         "render",
         "words",
+        "--path",
+        "capture",
         "--what",
         "relevancy",
         "--query",
@@ -160,6 +168,14 @@ def small_table(folder):
     np.savez(folder / "toy.npz", names=np.array(LABELS), embeddings=vectors(LABELS))
 
 
+def leave_colours_alone(folder):
+    scene = Scene.read(folder / "words/export")
+    del scene.parameters["features"]
+    shutil.rmtree(folder / "words/export")
+    none = {"labels": None, "label_names": None, "label_embeddings": None}
+    published(folder / "words/export", replace(scene, **none))
+
+
 @pytest.mark.parametrize(
     ("damage", "arguments", "code", "said"),
     [
@@ -170,6 +186,12 @@ def small_table(folder):
         (None, ["store", "seat"], 2, "no finished scene"),
         (None, ["words", " "], 2, "empty"),
         (remove("words/teacher"), ["words", "seat"], 2, "no teacher's artifact"),
+        (
+            leave_colours_alone,
+            ["words", "seat"],
+            2,
+            "make scene=words set=teacher.model=MODEL.onnx",
+        ),
         (put("toy.onnx", "another"), ["words", "seat"], 3, "toy.onnx is not the model"),
         (small_table, ["words", "sofa"], 3, "choose with --against"),
     ],

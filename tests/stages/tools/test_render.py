@@ -12,16 +12,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from box_room import room
 from click.testing import CliRunner
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 import chebsplat
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.evaluation import Evaluation
+from chebsplat.formats.ply import write_ply
 from chebsplat.pipelines.cli import main
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.sources.colmap_model import read_model
-from chebsplat.stages.tools import camera_files, camera_paths, frames
+from chebsplat.stages.tools import camera_files, camera_paths
 from chebsplat.stages.tools.frames import kinds_of
 from chebsplat.stages.tools.scene import Camera
 
@@ -58,6 +61,8 @@ def test_frames_are_what_is_evaluated_and_what_python_renders(scene, folder, toy
     run(
         "render",
         folder,
+        "--path",
+        "capture",
         "--what",
         "color,labels,depth,relevancy",
         "--query",
@@ -154,7 +159,8 @@ def test_a_hundred_frames_outlive_a_kill_and_equal_evaluates_renders(scene, fold
     file = hundred(scene, tmp_path / "cameras.json")
     there = killed_and_resumed(folder, tmp_path / "frames", file, size, 7)
     assert 7 <= len(there) < 100
-    renderer, (width, height) = SceneRenderer(scene.parameters), map(int, size.split("x"))
+    renderer = SceneRenderer(scene.parameters, Ks=scene.exported.cameras.Ks)
+    width, height = map(int, size.split("x"))
     for k, row in enumerate(json.loads(file.read_text())):
         rotation = np.array(row["rotation"]).T
         pose = np.eye(4)
@@ -241,7 +247,7 @@ def ring(n=12, tilt=0.3):
     K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
     for angle in np.arange(n) * 2 * np.pi / n:
         eye = np.array([1 + 3 * np.cos(angle), 2 + 3 * np.sin(angle), 3 * tilt])
-        pose = camera_paths.looking(eye, np.array([1.0, 2, 0]), np.array([0, 0, 1.0]))
+        pose = camera_paths.look_at(eye, np.array([1.0, 2, 0]), np.array([0, 0, 1.0]))
         yield Camera(f"{angle:.2f}", K, pose, 100, 80)
 
 
@@ -273,6 +279,74 @@ def test_a_path_flies_through_its_keys_at_their_lenses():
             camera_paths.between(wrong, n)
 
 
+def turned_round(camera):
+    """The camera where it stands, looking the other way."""
+    return replace(camera, cam_from_world=np.diag([-1.0, 1, -1, 1]) @ camera.cam_from_world)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "inwards"),
+    [
+        (list(ring()), True),
+        (list(ring())[:6], False),  # from one side
+        ([turned_round(camera) for camera in ring()], False),  # a room, from its middle
+    ],
+)
+def test_cameras_look_inwards_where_they_stand_around_what_they_look_at(cameras, inwards):
+    assert camera_paths.look_inwards(cameras, np.array([0, 0, 1.0])) is inwards
+
+
+def test_a_flight_follows_shaken_cameras_in_any_order_smooth_and_level():
+    rng, up = np.random.default_rng(0), np.array([0, 0, 1.0])
+    cameras = []
+    for camera in map(turned_round, ring(60)):  # outwards, as a room is taken
+        shaken = np.eye(4)
+        shaken[:3, :3] = Rotation.from_rotvec(rng.normal(0, 0.05, 3)).as_matrix()
+        cameras.append(replace(camera, cam_from_world=shaken @ camera.cam_from_world))
+    flights = [
+        camera_paths.fly_along(order, None, up, depth=3.0)
+        for order in (cameras, [cameras[0], *(cameras[k] for k in 1 + rng.permutation(59))])
+    ]
+    for path in flights:
+        poses = np.stack([frame.cam_from_world for frame in path])
+        assert np.abs(poses[:, 0, :3] @ up).max() < 1e-9 and (poses[:, 1, 2] < 0).all()
+        turns = np.arccos((poses[1:, 2, :3] * poses[:-1, 2, :3]).sum(1))
+        assert turns.max() < 1.5 * np.radians(354) / len(path)  # shaken by 3 degrees from one on
+        away = np.linalg.norm([frame.position - [1, 2, 0.9] for frame in path], axis=1)
+        assert away.min() > 2.7 and away.max() < 3.01  # on the ring, but smoother
+    assert abs(len(flights[0]) - len(flights[1])) < 0.1 * len(flights[0])
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_the_path_of_a_bare_splat_goes_round_within_a_room_or_about_a_thing(tmp_path, inside):
+    parameters, _, _ = room()
+    if not inside:  # a solid ball
+        rng = np.random.default_rng(0)
+        parameters["means"] = rng.normal(size=parameters["means"].shape).astype(np.float32)
+    ply = tmp_path / "theirs.ply"
+    write_ply(ply, {name: v for name, v in parameters.items() if name != "degrees"}, 1)
+    run("lift", ply, "--up", "z", "--out", tmp_path / "scene")
+    opened = chebsplat.load(tmp_path / "scene")
+    for camera in camera_paths.path_of(opened, "auto", 8):
+        x, y, z = camera.position
+        within = abs(x) < 2.5 and abs(y) < 2 and 0 < z < 2.5
+        assert within if inside else np.linalg.norm(camera.position) > 3
+        assert (opened.render(camera.resized(64, 48)).alpha >= 0.5).mean() > (
+            0.9 if inside else 0.2
+        )
+
+
+@pytest.mark.xdist_group("toy")
+def test_frames_of_next_to_nothing_are_warned_of(scene, folder, tmp_path, caplog):
+    there = scene.cameras[0]
+    away = np.eye(4)
+    away[2, 3] = 1e4  # the room is a dot
+    rows = camera_files.gs_cameras([there, there, replace(there, cam_from_world=away), there])
+    (tmp_path / "path.json").write_text(json.dumps(rows))
+    run("render", folder, "--path", tmp_path / "path.json", "--out", tmp_path / "frames")
+    assert "25 % of the frames show next to nothing" in caplog.text
+
+
 def test_another_size_shows_all_of_the_view_in_square_pixels():
     camera = next(ring())
     wide = camera_paths.fitted(camera, (400, 160))
@@ -294,9 +368,11 @@ def test_what_cannot_be_rendered_is_said(scene, folder, toy, tmp_path):
         with pytest.raises(ConfigError, match=message):
             kinds_of(text, scene, asked)
     assert (
-        "orbit, capture or a .json"
+        "flight, orbit, capture or a .json"
         in run("render", folder, "--path", "walk", "--out", tmp_path, code=2).stderr
     )
+    refused = run("render", folder, "--out", tmp_path / "x.avi", code=2)
+    assert "ends in .mp4" in refused.stderr and not (tmp_path / "x.avi").exists()
     (tmp_path / "x").mkdir()
     (tmp_path / "x/notes.txt").write_text("mine")
     assert (
@@ -339,6 +415,7 @@ def test_a_video_has_a_frame_for_every_camera(folder, tmp_path):
 @pytest.mark.xdist_group("toy")
 def test_a_video_without_its_package_is_one_line(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    refused = run("render", folder, "--out", tmp_path / "room.mp4", code=2)
-    assert refused.stderr.strip().count("\n") == 0
-    assert frames.INSTALL in refused.stderr
+    for scene in (folder, tmp_path / "no-such-scene"):  # before a scene is opened
+        refused = run("render", scene, "--out", tmp_path / "room.mp4", code=2)
+        assert refused.stderr.strip().count("\n") == 0
+        assert "needs the extra `video`: " in refused.stderr and "[video]" in refused.stderr

@@ -3,22 +3,29 @@ follow it.
 """
 
 import json
+from functools import lru_cache
 
 import numpy as np
 import pytest
 from box_room import made
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
+from shared import data
 
 from chebsplat.cameras import centers
 from chebsplat.errors import ConfigError
 from chebsplat.formats.meshes import Mesh
 from chebsplat.formats.ply import write_ply
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.splats import read_splats
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.cli.group import Upward
+from chebsplat.splats.gaussians import local_shape
+from chebsplat.splats.parts import cubes_of
 from chebsplat.stages.tools import camera_paths, up
 from chebsplat.stages.tools.mesh import turned
+from chebsplat.synthetic import layout, shuffled
+from chebsplat.synthetic.rays import RayCaster, intrinsics, walk
 from tests.stages.tools.test_page import held_in
 from tests.stages.tools.test_render import ring
 
@@ -72,10 +79,77 @@ def furnished(turn, rng):
     return {name: values.astype(np.float32) for name, values in raw.items()}
 
 
-@pytest.mark.parametrize("turn", TURNS)
-def test_the_floor_of_a_furnished_room_tells_up_whichever_way_it_is_turned(turn):
-    found = up.up_of("auto", furnished(turn, np.random.default_rng(0)))
-    assert np.degrees(np.arccos(np.clip(found @ turn[:, 2], -1, 1))) < 1.5
+def flat_gaussians(means, normals):
+    """Raw parameters of thin discs of 5 cm at points [N, 3] with these unit normals."""
+    z = np.array([0, 0, 1])
+    turns = np.column_stack([1 + normals @ z, np.cross(z, normals)])  # not for normal = -z
+    raw = {
+        "means": means,
+        "quats": turns / np.linalg.norm(turns, axis=1, keepdims=True),
+        "log_scales": np.tile(np.log([0.05, 0.05, 0.004]), (len(means), 1)),
+        "logit_opacities": np.full(len(means), 3.0),
+        "sh0": np.zeros((len(means), 1, 3)),
+    }
+    return {name: np.asarray(values, np.float32) for name, values in raw.items()}
+
+
+@lru_cache
+def seen_from_within(preset, seed):
+    """Points and normals of what 20 views along the walk through a generated room show, one in a
+    cube of a decimetre, noisy by a centimetre and six degrees.
+    """
+    room = (shuffled if preset == "shuffled" else layout).build(preset, seed)
+    rng, K = np.random.default_rng(seed), intrinsics(64, 48)
+    pixels = np.stack(np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5, [1.0]), -1)
+    eyes, rays = [], []
+    for pose in walk(room.size, 20, seed):
+        rays.append(pixels.reshape(-1, 3) @ np.linalg.inv(K).T @ pose[:3, :3])
+        eyes.append(np.tile(-pose[:3, :3].T @ pose[:3, 3], (len(rays[-1]), 1)))
+    eyes, rays = np.concatenate(eyes), np.concatenate(rays)
+    hits = RayCaster(room.soup.vertices, room.soup.triangles).cast(eyes, rays)
+    normals = hits.normals + rng.normal(0, 0.1, hits.normals.shape)
+    means = eyes + hits.distance[:, None] * rays + rng.normal(0, 0.01, eyes.shape)
+    rows = np.unique(cubes_of(means, 0.1), return_index=True)[1]
+    return means[rows], normals[rows] / np.linalg.norm(normals[rows], axis=1, keepdims=True)
+
+
+ROOMS = [
+    *(("office", seed) for seed in (3, 4, 5)),
+    *(("room", seed) for seed in (3, 4)),
+    *(("shuffled", seed) for seed in (3, 4, 5)),
+]
+
+
+def test_up_of_forty_turned_rooms_is_told_without_cameras(caplog):
+    right = 0
+    for number, turn in enumerate(Rotation.random(40, random_state=0).as_matrix()):
+        means, normals = seen_from_within(*ROOMS[number % len(ROOMS)])
+        up_found = up.up_of("auto", flat_gaussians(means @ turn.T, normals @ turn.T))
+        right += up_found @ turn[:, 2] > np.cos(np.radians(3))
+    assert right >= 38 and caplog.text.count("not sure which way is up") <= 2
+
+
+@pytest.mark.parametrize("thing", ["guitar", "statue", "ball"])
+def test_up_of_what_is_no_room_is_said_to_be_unsure(thing, caplog):
+    if thing == "guitar":
+        parameters, _, _ = read_splats(data("gs_ply") / "guitar_decoded_sh0.ply")
+    elif thing == "statue":
+        parameters = flat_gaussians(*measured_statue())
+    else:
+        points = np.random.default_rng(0).normal(size=(4000, 3))
+        normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+        parameters = flat_gaussians(normals, normals)
+    up.up_of("auto", parameters)
+    assert "not sure which way is up" in caplog.text and "--up" in caplog.text
+
+
+def measured_statue():
+    """Points of a COLMAP model, and the normals of their neighbourhoods."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction(str(data("statue_colmap") / "sparse/0"))
+    points = np.stack([point.xyz for point in model.points3D.values()])
+    return points, local_shape(points, 16)[1]
 
 
 def test_cameras_tell_up_where_they_can(caplog):
@@ -91,8 +165,10 @@ def test_cameras_tell_up_where_they_can(caplog):
 
 
 @pytest.mark.parametrize(("text", "found"), [
-    ("z", [0, 0, 1]), ("-y", [0, -1, 0]), ("+x", [1, 0, 0]), ("0,-2,0", [0, -1, 0]), ("-3,0,4", [-0.6, 0, 0.8]),
-    ("auto", "auto"), ("w", None), ("--y", None), ("1,2", None), ("0,0,0", None), ("nan,0,1", None), ("", None),
+    ("z", [0, 0, 1]), ("-y", [0, -1, 0]), ("+x", [1, 0, 0]), ("0,-2,0", [0, -1, 0]),
+    ("-3,0,4", [-0.6, 0, 0.8]),
+    ("auto", "auto"), ("w", None), ("--y", None), ("1,2", None), ("0,0,0", None), ("nan,0,1", None),
+    ("", None),
 ])  # fmt: skip
 def test_up_is_a_letter_three_numbers_or_auto(text, found):
     if found is None:
@@ -143,10 +219,9 @@ def test_page_and_orbit_of_a_scene_take_up_as_given(scene, tmp_path):
     assert np.ptp(heights) < 1e-6  # a level round
     level = np.array([np.array(row["rotation"])[:, 0] for row in rows]) @ np.array([-1, 0, 1])
     assert np.abs(level).max() < 1e-6  # horizons are level
-    done = CliRunner().invoke(
-        main, ["render", str(scene), "--up", "z", "--out", str(tmp_path / "no")]
-    )
-    assert done.exit_code == 2 and "add --path orbit" in done.output
+    command = ["cameras", str(scene), "--up", "z", "--out", str(tmp_path / "no")]
+    done = CliRunner().invoke(main, command)
+    assert done.exit_code == 2 and "leave out --up or --path" in done.output
 
 
 def test_orbits_without_up_are_as_before_and_with_it_go_round_it():

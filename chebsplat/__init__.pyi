@@ -1,0 +1,4 @@
+from chebsplat.pipelines.api import load, run_stage, train
+
+__all__ = ("load", "run_stage", "train")
+__version__: str

@@ -1,0 +1,120 @@
+"""Three newcomers type the commands of README and usage: photos of a phone, the named scene, and a
+splat that somebody else trained.
+"""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+
+import pytest
+from PIL import Image
+from shared import ROOT, run_stage
+
+from chebsplat.formats.capture import Capture
+
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("users")]
+COMMAND = re.compile(r"^    (?:\.venv/bin/)?((?:chebsplat|make) .*?)(?:\s+# .*)?$", re.MULTILINE)
+# what a test cannot ask for: other people's files, the network, a cluster, hours, another device
+ELSEWHERE = re.compile(
+    r"get-teacher|lseg|segformer|knowledge=flat|forget|FILE|rebuild|quality=|\bmethod\b|ablation|"
+    r"sequence|device=|make (?:test|lint|lock|gpu|stability|setup|bench)|on=slurm|clean-stale| rm |"
+    r"seconds=|-v run|stage=sfm"
+)
+PHOTO_STEPS = "train.steps=150,sfm.max_points=4000"
+
+
+def commands(page):
+    return [
+        text for text in COMMAND.findall((ROOT / page).read_text()) if not ELSEWHERE.search(text)
+    ]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder to type commands in, with photos of a room in it as a phone leaves them."""
+    folder = tmp_path_factory.mktemp("users")
+    config = {
+        "source": {"kind": "generated", "preset": "room", "seed": 3},
+        "ingest": {"max_views": 40},
+    }
+    assert run_stage("ingest", folder / "room", {}, config) == 0
+    (folder / "photos").mkdir()
+    for k, image in enumerate(Capture.read(folder / "room").images[:]):
+        Image.fromarray(image).save(folder / f"photos/IMG_{k:04d}.JPG", quality=92)
+    return folder
+
+
+def typed(place, text, **names):
+    """Exit code and output of a command of a page, in the place, for these names instead."""
+    for old, new in names.items():
+        text = re.sub(rf"(?<![\w.-]){re.escape(old)}(?![\w-])", new, text)
+    parts = shlex.split(text)
+    run = (
+        ["make", "-C", str(ROOT), *parts[1:]]
+        if parts[0] == "make"
+        else [sys.executable, "-P", "-m", "chebsplat.pipelines.cli", *parts[1:]]
+    )
+    given = os.environ | {"CHEBSPLAT_WORK": str(place / "work"), "BROWSER": "true"}
+    done = subprocess.run(run, cwd=place, capture_output=True, text=True, env=given, timeout=900)
+    return done.returncode, done.stdout + done.stderr, parts
+
+
+def check(place, texts, **names):
+    """All of them end well, and leave what their --out names; or a line asks for an extra."""
+    wrong = []
+    for text in texts:
+        code, output, parts = typed(place, text, **names)
+        last = output.strip().splitlines()[-1] if output.strip() else ""
+        out = place / parts[parts.index("--out") + 1] if "--out" in parts else None
+        missing = code != 0 and "pip install -e" in output
+        if not missing and (code != 0 or not last or (out is not None and not out.exists())):
+            wrong.append(f"{text}: exit {code}: {last}")
+        if "Traceback" in output:
+            wrong.append(f"{text}: Traceback")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_who_has_photos_gets_a_scene_of_colours_and_is_told_how_to_name_it(place):
+    photos = f"{place}/photos/"
+    texts = [text for text in commands("README.md") if "path/to/folder" in text]
+    assert len(texts) == 2
+    for text in texts:
+        code, output, _ = typed(place, f"{text} set={PHOTO_STEPS}", **{"path/to/folder/": photos})
+        assert code == 0, output[-2000:]
+    assert re.search(r"report.*\.html", output) and "teacher" in output
+    code, output, _ = typed(place, "chebsplat query photos sofa")
+    assert code == 2 and "get-teacher" in output
+
+
+def test_who_runs_the_named_scene_can_look_at_it_ask_it_and_take_of_it(place):
+    code, output, _ = typed(place, "make scene=toy")
+    assert code == 0, output[-2000:]
+    texts = [
+        text
+        for page in ("README.md", "docs/usage.md")
+        for text in commands(page)
+        if "office0" in text
+    ]
+    assert len(texts) > 15
+    check(place, texts, office0="toy", sofa="desk", couch="desk", **{"1280x960": "64x48"})
+
+
+def test_who_has_a_splat_alone_can_look_at_it_and_name_it(place):
+    if not (place / "work/toy").exists():
+        assert typed(place, "make scene=toy")[0] == 0
+    ply = place / "theirs.ply"
+    ply.write_bytes((place / "work/toy/export/scene.ply").read_bytes())
+    splat = re.compile(r"(theirs|any)\.ply")
+    texts = [
+        *filter(splat.search, commands("README.md")),
+        *filter(splat.search, commands("docs/usage.md")),
+    ]
+    assert len(texts) >= 4
+    for text in texts:
+        shutil.rmtree(place / "theirs", ignore_errors=True)
+        for name in ("named.ply", "named.npz"):
+            (place / name).unlink(missing_ok=True)
+        check(place, [text], office0="toy", **{"any.ply": "theirs.ply"})
