@@ -19,7 +19,7 @@ def main(folder: str, word: str, out: str) -> None:
     low, high = means.min(0), means.max(0)
     print(
         f"centres from {low.round(2).tolist()} to {high.round(2).tolist()}, scene units; "
-        f"{part.to_ply(out)}"
+        f"{part.export(out)}"
     )
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +13,7 @@ from scipy.spatial import cKDTree
 from chebsplat.errors import ConfigError
 from chebsplat.formats.extras import extra
 from chebsplat.formats.files import atomic_path
+from chebsplat.formats.gltf import linear_light, write_glb
 
 BLOCK = 16  # voxels along a block of the grid
 N_BLOCKS = 20_000  # initial blocks of the grid, which grows
@@ -23,7 +22,6 @@ LEAST_WEIGHT = 3.0  # a voxel of the surface is in more views than this
 TOUCHED = 4  # open3d samples every fourth pixel along each axis for blocks of a frame
 EASY = 100_000  # triangles that the quadric collapse handles in about a second
 PER_CELL = 0.85  # share of a fused mesh's triangles that clustering by its own voxels keeps
-GLTF_FLOAT, GLTF_UINT, GLTF_UBYTE, GLTF_VERTICES, GLTF_INDICES = 5126, 5125, 5121, 34962, 34963
 
 
 class Mesh(NamedTuple):
@@ -134,7 +132,7 @@ def write_mesh(path: Path, mesh: Mesh, names: list[str] | None = None) -> None:
     Raises: ConfigError on another suffix.
     Choices: PLY has an int property `label`, -1 for none, and comments `label ID NAME`. GLB has
       `_LABEL` as a float attribute, 255 values and more without loss, and the names in the mesh's
-      extras; its axes are the scene's.
+      extras; its material is rough, its colours in linear light, so that viewers shade it.
     """
     writers = {".ply": _ply, ".glb": _glb}
     if path.suffix.lower() not in writers:
@@ -167,42 +165,24 @@ def _ply(path: Path, mesh: Mesh, names: list[str]) -> None:
 
 
 def _glb(path: Path, mesh: Mesh, names: list[str]) -> None:
-    opaque = np.concatenate([mesh.colors, np.full((len(mesh.colors), 1), 255, np.uint8)], 1)
-    parts = [
-        ("POSITION", np.ascontiguousarray(mesh.vertices, np.float32), GLTF_FLOAT, "VEC3"),
-        ("COLOR_0", opaque, GLTF_UBYTE, "VEC4"),
-    ]
-    if mesh.labels is not None:
-        parts.append(("_LABEL", mesh.labels.astype(np.float32), GLTF_FLOAT, "SCALAR"))
-    parts.append(("indices", mesh.triangles.astype(np.uint32).ravel(), GLTF_UINT, "SCALAR"))
-    views, accessors, offset = [], [], 0
-    for k, (name, values, kind, shape) in enumerate(parts):
-        target = GLTF_INDICES if name == "indices" else GLTF_VERTICES
-        views.append(
-            {"buffer": 0, "byteOffset": offset, "byteLength": values.nbytes, "target": target}
-        )
-        accessor = {"bufferView": k, "componentType": kind, "count": len(values), "type": shape}
-        if name == "POSITION":
-            accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
-        accessors.append(accessor | ({"normalized": True} if name == "COLOR_0" else {}))
-        offset += values.nbytes
-    attributes = {name: k for k, (name, *_) in enumerate(parts) if name != "indices"}
-    primitive = {"attributes": attributes, "indices": len(parts) - 1}
-    document = {
-        "asset": {"version": "2.0", "generator": "chebsplat"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive], "extras": {"label_names": names}}],
-        "buffers": [{"byteLength": offset}],
-        "bufferViews": views,
-        "accessors": accessors,
+    attributes = {
+        "POSITION": mesh.vertices.astype(np.float32),
+        "NORMAL": normals(mesh),
+        "COLOR_0": linear_light(mesh.colors / 255),
     }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    with path.open("wb") as stream:
-        stream.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + offset))
-        stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        stream.write(struct.pack("<I4s", offset, b"BIN\0"))
-        for _, values, _, _ in parts:
-            stream.write(values.tobytes())
+    if mesh.labels is not None:
+        attributes["_LABEL"] = mesh.labels.astype(np.float32)
+    rough = {"pbrMetallicRoughness": {"metallicFactor": 0.0}, "doubleSided": True}
+    triangles = mesh.triangles.astype(np.uint32).ravel()
+    write_glb(path, attributes, {"material": 0}, triangles, names, materials=[rough])
+
+
+def normals(mesh: Mesh) -> np.ndarray:
+    """Unit normals of the vertices, f32 [V, 3]: area-weighted means of their triangles, or z."""
+    a, b, c = mesh.vertices.astype(np.float64)[mesh.triangles.T]
+    sums = np.zeros((len(mesh.vertices), 3))
+    for corner in mesh.triangles.T:
+        np.add.at(sums, corner, np.cross(b - a, c - a))
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    unit = np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1), [0.0, 0.0, 1.0])
+    return unit.astype(np.float32)

@@ -32,7 +32,7 @@ class Packed:
       the others in order (wxyz, the largest positive) as 10 bits each over ±1/√2.
     opacities:  u8 [N] of [0, 1]; colors: u8 [3, N], of SH degree 0, 1 is white.
     sh1:        i8 [9, N], coefficients of band 1, coefficient-major; optional.
-    features:   i8 [C, N]; optional.
+    features:   i8 [C, R], a dictionary, and meanings: u16 [N], each Gaussian's row of it; optional.
     """
 
     arrays: dict[str, np.ndarray]
@@ -58,16 +58,9 @@ def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
         integers: np.ndarray = np.round((values - low) / step).T
         return integers
 
-    low, middle, high = np.quantile(
-        parameters["means"].astype(np.float64), (0.05, 0.5, 0.95), axis=0
-    )
-    away = parameters["means"] - middle
-    drawn = np.minimum(
-        FARTHEST * ((high - low).max() or np.inf) / np.linalg.norm(away, axis=1).clip(1e-300), 1
-    )
-    means = levels("means", middle + drawn[:, None] * away, (1 << 24) - 1).astype(np.uint32)
+    near, log_scales = drawn_near(parameters["means"], parameters["log_scales"])
+    means = levels("means", near, (1 << 24) - 1).astype(np.uint32)
     arrays["means"] = np.stack([means >> shift & 255 for shift in (0, 8, 16)], 1).astype(np.uint8)
-    log_scales = parameters["log_scales"] + np.log(drawn)[:, None]
     bounds = np.quantile(log_scales.max(1), (0.05, 0.95)) + np.array([LEAST, MOST])
     arrays["log_scales"] = levels("log_scales", log_scales.clip(*bounds), 255).astype(np.uint8)
     words = smallest_three(parameters["quats"])
@@ -79,8 +72,30 @@ def pack(parameters: dict[str, np.ndarray], sh_degree: int = 0) -> Packed:
     if sh_degree:
         arrays["sh1"], ranges["sh1"] = signed(parameters["shN"][:, :3].reshape(len(colors), 9))
     if "features" in parameters:
-        arrays["features"], ranges["features"] = signed(parameters["features"])
+        dictionary, rows = np.unique(parameters["features"], axis=0, return_inverse=True)
+        arrays["features"], ranges["features"] = signed(dictionary)
+        arrays["meanings"] = rows.reshape(-1).astype(np.uint16)
     return Packed(arrays, ranges)
+
+
+def drawn_near(means: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres [N, 3], f64, and log-scales [N, 3], those beyond FARTHEST drawn there."""
+    low, middle, high = np.quantile(means.astype(np.float64), (0.05, 0.5, 0.95), axis=0)
+    away = means - middle
+    drawn = np.minimum(
+        FARTHEST * ((high - low).max() or np.inf) / np.linalg.norm(away, axis=1).clip(1e-300), 1
+    )
+    return middle + drawn[:, None] * away, log_scales + np.log(drawn)[:, None]
+
+
+def along_a_curve(means: np.ndarray) -> np.ndarray:
+    """Order i64 [N] of centres [N, 3] along Morton's curve, with 16 bits an axis of their box."""
+    low = means.min(0)
+    cells = (65535 * (means - low) / max((means.max(0) - low).max(), 1e-300)).astype(">u2")
+    bits = np.unpackbits(np.ascontiguousarray(cells).view(np.uint8).reshape(-1, 3, 2), axis=2)
+    codes = np.zeros((len(means), 8), np.uint8)
+    codes[:, 2:] = np.packbits(bits.transpose(0, 2, 1).reshape(len(means), 48), axis=1)
+    return np.argsort(codes.view(">u8")[:, 0], kind="stable")
 
 
 def unpack(packed: Packed) -> dict[str, np.ndarray]:
@@ -110,8 +125,32 @@ def unpack(packed: Packed) -> dict[str, np.ndarray]:
     if "sh1" in arrays:
         parameters["shN"][:, :3] = values("sh1", arrays["sh1"]).reshape(-1, 3, 3)
     if "features" in arrays:
-        parameters["features"] = values("features", arrays["features"])
+        parameters["features"] = values("features", arrays["features"])[arrays["meanings"]]
     return {name: value.astype(np.float32) for name, value in parameters.items()}
+
+
+def raw_parameters(
+    means: np.ndarray,
+    log_scales: np.ndarray,
+    quats: np.ndarray,
+    alphas: np.ndarray,
+    sh0: np.ndarray,
+    sh: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Raw parameters from quantised ones; alphas: bytes [N]; sh0 [N, 3]; sh [N, K, 3]."""
+    opacities = alphas / 255
+    with np.errstate(divide="ignore"):  # 0 and 1
+        logits = np.log(opacities / (1 - opacities))
+    shN = np.zeros((len(means), 15, 3), np.float32)
+    shN[:, : sh.shape[1]] = sh
+    raw = {
+        "means": means,
+        "log_scales": log_scales,
+        "quats": quats,
+        "logit_opacities": logits,
+        "sh0": sh0[:, None],
+    }
+    return {name: values.astype(np.float32) for name, values in raw.items()} | {"shN": shN}
 
 
 def signed(rows: np.ndarray) -> tuple[np.ndarray, dict[str, list[float]]]:

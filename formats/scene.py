@@ -1,4 +1,4 @@
-"""`scene/3`: the exported scene: PLY for viewers, ragged arrays, label names and a summary."""
+"""`scene/4`: the exported scene: PLY and SPZ for viewers, ragged arrays, label names, a summary."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 
+from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.artifact import read_document, write_document
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.ply import REST, write_ply
 from chebsplat.formats.record import Array, Record
+from chebsplat.formats.spz import write_spz
 from chebsplat.formats.world import World
 
 LABELS = "labels.json"
+MOST_MEANINGS = 65_536  # rows of the dictionary, which two bytes count
+REMEDY = "export the scene again"
+SEMANTIC = ("features", "meanings", "labels", "label_embeddings")
 RAGGED = ("means", "log_scales", "quats", "sh0", "logit_opacities", "sh1", "sh2", "sh3")
 
 
@@ -35,7 +40,7 @@ class Scene:
       `formats.world.World` is another.
     """
 
-    SCHEMA: ClassVar[str] = "chebsplat.scene/3"
+    SCHEMA: ClassVar[str] = "chebsplat.scene/4"
     parameters: dict[str, np.ndarray]
     cameras: Cameras
     order: np.ndarray
@@ -47,10 +52,11 @@ class Scene:
     def write(self, out: Path) -> dict[str, int]:
         """Fill the directory that `artifact.publish` yields; returns bytes by part.
 
-        Choices: `scene.ply` is trimmed to the highest degree in use; `scene_d<k>.ply` hold each
-          degree apart, each valid on its own; all are in the source's world. Features are 16-bit
-          fixed point: as small as halves, 20 times as exact. Degrees are stored in the checkpoint's
-          order, which they then tell.
+        Raises:  ValueError on more than MOST_MEANINGS distinct features.
+        Choices: `scene.ply` is trimmed to the highest degree in use, and `scene.spz` beside it
+          if SPZ can represent the scene; both are in the source's world. Features are rows of a
+          dictionary, in 16-bit fixed point: as small as halves, 20 times as exact. Degrees are
+          stored in the checkpoint's order, which they then tell.
         """
         p, degrees, world = self.parameters, self.parameters["degrees"], World.read(self.summary)
         unsorted = np.empty_like(degrees)
@@ -59,24 +65,23 @@ class Scene:
             raise ValueError("Gaussians are not sorted by degree, stably")
         top = int(degrees.max(initial=0))
         write_ply(out / "scene.ply", p, top, self.labels, self.label_names, world)
-        if len(np.unique(degrees)) > 1:
-            for degree in np.unique(degrees):
-                of_degree = degrees == degree
-                part = {name: values[of_degree] for name, values in p.items()}
-                labels = None if self.labels is None else self.labels[of_degree]
-                write_ply(
-                    out / f"scene_d{degree}.ply", part, int(degree), labels, self.label_names, world
-                )
+        try:
+            write_spz(out / "scene.spz", p, top, world)
+        except DataFailure as error:
+            self.summary["left_out"] = self.summary.get("left_out", {}) | {"scene.spz": str(error)}
         bands = {}
         for band in range(1, top + 1):
             rows = p["shN"][degrees >= band, REST[band - 1] : REST[band]]
             bands[f"sh{band}"] = rows.reshape(len(rows), -1)
-        steps = {
-            name: float(np.abs(p[name]).max(initial=0)) / 32767 or 1.0
-            for name in ("features",)
-            if name in p
-        }
-        fixed = {name: np.round(p[name] / step).astype(np.int16) for name, step in steps.items()}
+        steps, meanings = {}, {}
+        if "features" in p:
+            step = float(np.abs(p["features"]).max(initial=0)) / 32767 or 1.0
+            fixed = np.round(p["features"] / step).astype(np.int16)
+            dictionary, rows = np.unique(fixed, axis=0, return_inverse=True)
+            if len(dictionary) > MOST_MEANINGS:
+                raise ValueError(f"{len(dictionary):,} features differ, {MOST_MEANINGS:,} may")
+            steps["features"] = step
+            meanings = {"features": dictionary, "meanings": rows.reshape(-1).astype(np.uint16)}
         stored = RaggedScene(
             **{name: p[name] for name in ("means", "log_scales", "quats", "logit_opacities")},
             sh0=p["sh0"][:, 0],
@@ -87,17 +92,18 @@ class Scene:
             labels=self.labels,
             label_embeddings=self.label_embeddings,
             **bands,
-            **fixed,
+            **meanings,
         )
         stored.write(out)
         write_document(out / LABELS, dict(enumerate(self.label_names or [])))
         sizes = {
             "unpruned_ply": 62 * 4 * len(degrees),
             "ply": (out / "scene.ply").stat().st_size,
-            "split": sum(file.stat().st_size for file in out.glob("scene_d*.ply")),
             "ragged": _bytes_of(out, RAGGED),
-            "semantic": _bytes_of(out, ("features",)),
+            "semantic": _bytes_of(out, SEMANTIC),
         }
+        if (out / "scene.spz").exists():
+            sizes["spz"] = (out / "scene.spz").stat().st_size
         stored.summary["bytes"] = sizes
         stored.write_attributes(out)
         return sizes
@@ -120,8 +126,11 @@ class Scene:
             rows = getattr(stored, f"sh{band}").reshape(-1, width, 3)
             parameters["shN"][degrees >= band, REST[band - 1] : REST[band]] = rows
         parameters["degrees"] = degrees
-        for name, step in stored.steps.items():
-            parameters[name] = getattr(stored, name) * np.float32(step)
+        if stored.features is not None and stored.meanings is not None:
+            if stored.meanings.max(initial=0) >= len(stored.features):
+                raise InputError(f"{path / 'meanings'} names a row that features lack; {REMEDY}")
+            dictionary = stored.features * np.float32(stored.steps["features"])
+            parameters["features"] = dictionary[stored.meanings]
         names = (
             read_label_names(path, artifact.read_manifest(path))
             if stored.labels is not None
@@ -140,10 +149,10 @@ class Scene:
 
 @dataclass
 class RaggedScene(Record):
-    """`Scene` as stored: SH bands up to each Gaussian's degree, features in 16-bit fixed point.
+    """`Scene` as stored: SH bands up to each Gaussian's degree, features as rows of a dictionary.
 
     All but `degrees` are in order of degree. sh1, sh2, sh3: rows of the Gaussians that keep the
-    band. steps: the unit of `features`.
+    band. features: the dictionary in fixed point, with `meanings` as its rows; steps: their unit.
     """
 
     SCHEMA: ClassVar[str] = Scene.SCHEMA
@@ -161,7 +170,8 @@ class RaggedScene(Record):
     sh1: Annotated[np.ndarray | None, Array("float32", ("gaussian_1", 9))] = None
     sh2: Annotated[np.ndarray | None, Array("float32", ("gaussian_2", 15))] = None
     sh3: Annotated[np.ndarray | None, Array("float32", ("gaussian_3", 21))] = None
-    features: Annotated[np.ndarray | None, Array("int16", ("gaussian", "channel"), "a step")] = None
+    features: Annotated[np.ndarray | None, Array("int16", ("meaning", "channel"), "a step")] = None
+    meanings: Annotated[np.ndarray | None, Array("uint16", ("gaussian",), "row of features")] = None
     labels: Annotated[np.ndarray | None, Array("int32", ("gaussian",), "class index, -1 none")] = (
         None
     )

@@ -97,8 +97,7 @@ def run(job: Job) -> None:
     figures["n_gaussians"] = len(scene.parameters["means"])
     figures["bytes"] = scene.summary["bytes"]
     figures |= timings(job, renderer, cameras, scene.labels is not None)
-    job.facts["layouts"] = layouts(job, scene, cameras[0], pictures["renders"][0])
-    job.facts["layout_error"] = max(job.facts["layouts"].values())
+    job.facts["layout_error"] = layout_error(job, scene, cameras[0], pictures["renders"][0])
     figures["lpips"] = figures["image"]["lpips"]
     if lpips is None:
         job.left_out("LPIPS", "evaluate.lpips_weights names no file: not measured")
@@ -189,23 +188,15 @@ def timings(
     return {"frames_per_second": per_second, "milliseconds": split}
 
 
-def layouts(job: Job, scene: Scene, view: View, image: np.ndarray) -> dict[str, int]:
-    """Largest difference, grey levels of 255, of a view rendered from each PLY layout and `image`.
+def layout_error(job: Job, scene: Scene, view: View, image: np.ndarray) -> int:
+    """Largest difference, grey levels of 255, of a view rendered from scene.ply and `image`.
 
     Args: image: u8 [H, W, 3], the view rendered from the ragged arrays.
     """
     path, world = job.inputs["scene"], World.read(scene.summary)
-    manifest, differences = read_manifest(path, Scene.SCHEMA), {"ragged": 0}
-    of_degrees = sorted(
-        name for name in manifest.files if name.startswith("scene_d") and name.endswith(".ply")
-    )
-    for layout, names in (("ply", ["scene.ply"]), ("split", of_degrees)):
-        if names:
-            parts = [read_ply(checked(path, manifest, name), world)[0] for name in names]
-            parameters = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-            render = SceneRenderer(parameters, job.device).render(view)[0]
-            differences[layout] = int(np.abs(render.astype(int) - image).max())
-    return differences
+    ply = checked(path, read_manifest(path, Scene.SCHEMA), "scene.ply")
+    render = SceneRenderer(read_ply(ply, world)[0], job.device).render(view)[0]
+    return int(np.abs(render.astype(int) - image).max())
 
 
 def camera(scene: Scene, index: int) -> View:

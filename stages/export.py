@@ -1,4 +1,4 @@
-"""export: the trained scene as PLY files, ragged arrays, a label dictionary and a summary."""
+"""export: the trained scene as PLY and SPZ, ragged arrays, a label dictionary and a summary."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from chebsplat.formats.lifted import Lifted, Refined
 from chebsplat.formats.scene import Scene
 from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
+from chebsplat.labels.dictionary import shared_features
 from chebsplat.stages.runtime.command import Job
 
 
@@ -22,8 +23,9 @@ def run(job: Job) -> None:
     Reads `gaussians`, for names of labels `features` and, in place of trained features, `refined`
     or `lifted`. Writes `scene`.
 
-    Choices: a Gaussian that no training view sees has lifted features of zero: no label, and no
-      part in rendered features.
+    Choices: Gaussians share the features of a dictionary, which labels also come from. A Gaussian
+      that no training view sees has lifted features of zero: no label, and no part in rendered
+      features.
     """
     gaussians = Gaussians.read(job.inputs["gaussians"])
     if len(gaussians.parameters["means"]) == 0:
@@ -43,7 +45,7 @@ def run(job: Job) -> None:
         job.left_out("labels", "no --in-features: the label embeddings are unknown")
     else:
         teacher = Features.read(job.inputs["features"])
-        parameters["features"] = semantic[order]
+        parameters["features"] = shared_features(semantic[order])
         if semantic.shape[1] != teacher.label_embeddings.shape[1]:
             raise InputError(
                 f"{job.inputs['features']} has other channels than the checkpoint; pass its own"

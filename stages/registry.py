@@ -111,9 +111,9 @@ STAGES: dict[str, Stage] = {
                ("features", "teacher"), ("knowledge", "recall")),
               help="Smooth the features of a finished scene and blend them with knowledge, as its "
                    "training views ask."),
-        Stage("export", "chebsplat.scene/3", (), (("gaussians", "train"),),
+        Stage("export", "chebsplat.scene/4", (), (("gaussians", "train"),),
               (("features", "teacher"), ("lifted", "lift"), ("refined", "refine")),
-              help="Write PLY files, ragged zarr, the label dictionary and the summary."),
+              help="Write PLY and SPZ, ragged zarr, the label dictionary and the summary."),
         Stage("evaluate", "chebsplat.evaluation/2", ("evaluate",),
               (("capture", "ingest"), ("scene", "export")),
               (("features", "teacher"),), on_device=True, device_packages=("gsplat",),

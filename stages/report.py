@@ -48,12 +48,12 @@ STAGE_OF = {
 BYTES = {
     "unpruned_ply": "plain 3DGS: every SH band, nothing else",
     "ply": "scene.ply: every SH band, label and SH degree",
-    "split": "PLY split by SH degree",
     "ragged": "ragged arrays",
     "semantic": "semantic arrays, beside either",
+    "spz": "scene.spz, lossy",
 }
-# layouts of plain 3DGS's values without the pruned bands
-SMALLER = ("split", "ragged")
+# layouts whose share of plain 3DGS is reported
+SMALLER = ("ragged", "spz")
 FRAMES = {"color": "colour", "color_and_features": "colour and features"}
 
 

@@ -36,10 +36,10 @@ class Commands(Guarded):
         return super().get_command(context, name)
 
     def resolve_command(self, context: click.Context, args: list[str]) -> Any:
-        of_a_file = any(word.startswith("--capture") or is_splat(word) for word in args[1:]) or (
-            len(args) > 1 and not args[1].startswith("-")
-        )
-        # `lift` is also a command on files
+        of_a_file = any(
+            word.startswith(("--capture", "--as")) or is_splat(word) for word in args[1:]
+        ) or (len(args) > 1 and not args[1].startswith("-"))
+        # `lift` is also a command on files, `export` on a finished scene
         if args[0] in STAGES and not (of_a_file and args[0] in self.commands):
             from chebsplat.stages.runtime.command import command
 

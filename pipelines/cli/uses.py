@@ -1,4 +1,4 @@
-"""Commands on a finished scene (query, mesh, extract, lift, label) and on teachers."""
+"""Commands on a finished scene (query, mesh, extract, export, lift, label) and on teachers."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from chebsplat.errors import ConfigError
+from chebsplat.formats.splats import WRITTEN
 from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath, Phrases, Upward
 
 
@@ -84,7 +85,7 @@ def get_teacher(name: str, out: Path | None, graph: str) -> None:
 
 @click.command()
 @click.argument("scene")
-@click.option("--out", type=NewPath(), required=True, help="the .ply to write")
+@click.option("--out", type=NewPath(*WRITTEN), required=True, help="the .ply, .spz, .sog or .glb")
 @click.option(
     "--keep-label", "labels", multiple=True, help="a name of labels.json; may be given again"
 )
@@ -101,7 +102,7 @@ def extract(
     text: str | None,
     against: list[str],
 ) -> None:
-    """Write part of a finished scene as one PLY: by words, label, opacity, box."""
+    """Write part of a finished scene as one splat: by words, label, opacity, box."""
     from chebsplat.pipelines.api import load
     from chebsplat.stages.tools.extract import corners
     from chebsplat.stages.tools.extract import extract as write
@@ -111,6 +112,33 @@ def extract(
     opened = load(scene)
     query_vectors = None if text is None else opened.understood(text, against)
     report(write(opened, out, labels, min_opacity, corners(box), query_vectors), out)
+
+
+@click.command()
+@click.argument("scene")
+@click.option(
+    "--as",
+    "kind",
+    type=click.Choice([suffix[1:] for suffix in WRITTEN]),
+    default="spz",
+    show_default=True,
+)
+@click.option("--out", type=click.Path(path_type=Path), help="default: named like the scene, here")
+@UP
+def export(scene: str, kind: str, out: Path | None, up: Any) -> None:
+    """Write a finished SCENE as one file for viewers; with --up turned upright, a .glb always.
+
+    Without a SCENE, this is the stage of the same name (--help).
+    """
+    from chebsplat.pipelines.api import load
+    from chebsplat.stages.tools.up import up_of
+
+    opened = load(scene)
+    path = NewPath(f".{kind}").convert(out or f"{Path(scene).resolve().name}.{kind}", None, None)
+    if up is not None:
+        up = up_of(up, opened.parameters, opened.exported.cameras.cam_from_world)
+    opened.export(path, up)
+    report({"Gaussians": len(opened), "bytes": path.stat().st_size}, path)
 
 
 @click.command()
@@ -239,7 +267,7 @@ def label(
 @UP
 def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool, up: Any) -> None:
     """Write the surface of a finished SCENE as triangles with colours and labels, in the scene's
-    frame; with --up turned, so that up is z, and y of a .glb.
+    frame; with --up turned, so that up is z. A .glb is turned in any case, up to y.
     """
     from chebsplat.formats.meshes import meshlab, write_mesh
     from chebsplat.pipelines.api import load
@@ -251,11 +279,11 @@ def mesh(scene: str, out: Path, voxel: float | None, triangles: int, raw: bool, 
         meshlab()  # missed before a scene is opened
     opened = load(scene)
     surface, facts = mesh_of(opened, voxel, triangles, raw, Progress())
-    if up is not None:
-        poses = opened.exported.cameras.cam_from_world
+    if up is not None or out.suffix.lower() == ".glb":
+        up, poses = "auto" if up is None else up, opened.exported.cameras.cam_from_world
         surface = turned(surface, up_of(up, opened.parameters, poses), out.suffix)
     write_mesh(out, surface, opened.label_names)
     report(facts, out)
 
 
-COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, lift, label, mesh)
+COMMANDS = (query, calibrate, check_teacher, get_teacher, extract, export, lift, label, mesh)

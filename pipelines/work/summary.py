@@ -59,7 +59,7 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
     psnr, miou, teacher = quality(measured)
     size = {
         name: text("{:.1f} MB", scaled(number(measured, "bytes", name)))
-        for name in ("ply", "split", "ragged")
+        for name in ("ply", "spz", "ragged")
     }
     others = ", ".join(f"{name} {value}" for name, value in size.items() if value and name != "ply")
     segmentation = (measured or {}).get("segmentation") or {}

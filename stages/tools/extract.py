@@ -1,4 +1,4 @@
-"""Part of a finished scene as one 3DGS PLY, selected by words, label, opacity and box."""
+"""Part of a finished scene as one splat, selected by words, label, opacity and box."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ from chebsplat.splats.parts import substantial
 from chebsplat.stages.tools.query import Query
 from chebsplat.stages.tools.scene import OpenedScene, filter_masks
 
-# for SPZ: scene.spz --spz-version 3
-CONVERT = "npx @playcanvas/splat-transform@2.7.1 scene.ply scene.compressed.ply"
-
 
 def extract(
     scene: OpenedScene,
@@ -27,23 +24,19 @@ def extract(
     """Write the Gaussians that pass every filter, trimmed to the highest SH degree among them.
 
     Args:
-      out:         the PLY to write; never overwritten.
+      out:         the splat to write, as of `OpenedScene.export`.
       labels:      names to keep; all where there are none.
       min_opacity: activated, in [0, 1]; box: x0, y0, z0, x1, y1, z1 of centres, scene units.
       query:       selects the connected parts above its cut; None: all.
     Returns: number of Gaussians written, and of those that each filter alone leaves out.
     Raises:  ConfigError on a filter that the scene cannot answer, DataFailure if nothing is left.
     """
-    if out.suffix != ".ply" or out.name.endswith(".compressed.ply"):
-        raise ConfigError(
-            f"{out}: only a plain .ply is written; convert that, for instance: {CONVERT}"
-        )
     filters = filter_masks(scene.exported, scene.source, labels, min_opacity, box)
     if query is not None:
         filters["query"] = select_by_query(scene.exported, query)
     n = len(scene)
     part = scene.part(filters)
-    part.to_ply(out)
+    part.export(out)
     left_out = {f"left out by {name}": int(n - keep.sum()) for name, keep in filters.items()}
     return {"kept": len(part), "of": n} | left_out
 

@@ -1,4 +1,4 @@
-"""A finished scene, opened: render, query and select; only `to_ply` writes a file."""
+"""A finished scene, opened: render, query and select; only `export` writes a file."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ import numpy as np
 import torch
 from scipy.special import expit
 
+from chebsplat.cameras import upright
 from chebsplat.errors import ConfigError, DataFailure
-from chebsplat.formats.files import atomic_path
 from chebsplat.formats.names import suggest
-from chebsplat.formats.ply import write_ply
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.splats import write_splats
 from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import lacking, rows_of
 from chebsplat.render import SceneRenderer
 from chebsplat.splats.gaussians import surface_of
+from chebsplat.splats.similarity import Similarity
 from chebsplat.stages.tools.query import Query, Relevancy, understood
+from chebsplat.stages.tools.up import up_of
 from chebsplat.views import View
 
 COVERED = 0.5  # least coverage of a pixel with a label
@@ -227,14 +229,25 @@ class OpenedScene:
         means = self.world.outward(self.parameters["means"])
         return means, np.round(surface_of(self.parameters)[1] * 255).astype(np.uint8)
 
-    def to_ply(self, path: str | Path) -> Path:
-        """Write a 3DGS PLY with labels in the SH degree in use. Raises ConfigError if it exists."""
+    def export(self, path: str | Path, up: np.ndarray | None = None) -> Path:
+        """Write a splat as .ply, .spz, .sog or .glb, by the name's ending; PLY and GLB have labels.
+
+        Args:    up: against gravity, unit [3]: the splat is turned so that up is -y, as in viewers,
+          or y of a .glb; None: it stays in the capture's frame, a .glb upright by the cameras.
+        Raises:  ConfigError if it exists or ends otherwise; DataFailure where SPZ cannot hold it.
+        """
         path = Path(path)
         if path.exists():
             raise ConfigError(f"{path} exists; remove it, or choose another path")
-        with atomic_path(path) as temporary:
-            top = int(self.parameters["degrees"].max())
-            write_ply(temporary, self.parameters, top, self.labels, self.label_names, self.world)
+        parameters, world, glb = self.parameters, self.world, path.suffix.lower() == ".glb"
+        if up is None and glb:
+            up = up_of("auto", parameters, self.exported.cameras.cam_from_world)
+        if up is not None:
+            turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright(up)
+            turn = turn if glb else np.diag([1.0, -1, -1]) @ turn
+            parameters = Similarity(1.0, turn, np.zeros(3)).of_gaussians(parameters)
+            world = World(tuple((turn @ world.origin).tolist()), world.scale)
+        write_splats(path, parameters, self.labels, self.label_names, world)
         return path
 
 

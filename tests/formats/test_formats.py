@@ -272,7 +272,7 @@ def test_damage_to_any_file_is_named_with_its_remedy(case, damage):
     for file in sorted(
         p
         for p in path.rglob("*")
-        if p.is_file() and p.suffix != ".ply" and p.name != "artifact.json"
+        if p.is_file() and p.suffix not in (".ply", ".spz") and p.name != "artifact.json"
     ):
         good = file.read_bytes()
         damage(file.name)(file.parent)
@@ -290,7 +290,7 @@ def test_every_numeric_artifact_of_a_scene_opens_as_a_zarr_group(toy):
     kinds = {
         "features/2",
         "gaussians/2",
-        "scene/3",
+        "scene/4",
         "capture/2",
         "points/2",
         "channels/2",
@@ -402,12 +402,22 @@ def test_fixed_point_features_are_within_half_a_step(tmp_path):
     assert np.abs(found - wanted).max() <= 0.51 * np.abs(wanted).max() / 32767
 
 
-def test_split_ply_files_hold_the_same_gaussians(tmp_path):
+def test_gaussians_that_mean_the_same_share_a_row(tmp_path):
     record = make_scene()
-    record.write(tmp_path)
-    parts = [ply.read_ply(file)[0]["means"] for file in sorted(tmp_path.glob("scene_d*.ply"))]
-    assert len(parts) > 1
-    assert np.array_equal(np.concatenate(parts), record.parameters["means"])
+    record.parameters["features"][3:] = record.parameters["features"][0]
+    published(tmp_path / "s", record)
+    stored = scene.RaggedScene.read(tmp_path / "s")
+    assert stored.features.shape == (3, 4) and stored.meanings.dtype == np.uint16
+    found = scene.Scene.read(tmp_path / "s").parameters["features"]
+    assert np.array_equal(found, record.parameters["features"])
+
+
+def test_a_scene_that_spz_cannot_hold_says_so(tmp_path):
+    record = make_scene()
+    record.parameters["log_scales"] += 9
+    sizes = record.write(tmp_path)
+    assert "spz" not in sizes and not (tmp_path / "scene.spz").exists()
+    assert "does not fit" in record.summary["left_out"]["scene.spz"]
 
 
 @pytest.mark.data

@@ -134,14 +134,22 @@ def test_both_files_hold_the_same_mesh(ball, tmp_path):
     binary = raw[28 + size :]
     found = []
     for accessor, view in zip(document["accessors"], document["bufferViews"], strict=True):
-        kind = {5126: "<f4", 5125: "<u4", 5121: "u1"}[accessor["componentType"]]
+        kind = {5126: "<f4", 5125: "<u4", 5123: "<u2"}[accessor["componentType"]]
         part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
         found.append(np.frombuffer(part, kind))
         assert view["byteOffset"] % 4 == 0
     np.testing.assert_array_equal(found[0].reshape(-1, 3), mesh.vertices)
-    np.testing.assert_array_equal(found[1].reshape(-1, 4)[:, :3], mesh.colors)
-    np.testing.assert_array_equal(found[2], labels)
-    np.testing.assert_array_equal(found[3].reshape(-1, 3), mesh.triangles)
+    # outwards, on a ball
+    outward = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
+    normals = found[1].reshape(-1, 3)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
+    assert np.median((normals * outward).sum(1)) > 0.9
+    linear = found[2].reshape(-1, 4)[:, :3] / 65535
+    display = np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
+    np.testing.assert_allclose(255 * display, mesh.colors, atol=0.05)
+    np.testing.assert_array_equal(found[3], labels)
+    np.testing.assert_array_equal(found[4].reshape(-1, 3), mesh.triangles)
+    assert document["materials"][0]["pbrMetallicRoughness"]["metallicFactor"] == 0
     assert document["meshes"][0]["extras"]["label_names"] == names
 
 

@@ -3,20 +3,26 @@ file.
 """
 
 import gzip
+import json
 import logging
 import struct
+import zipfile
 
 import numpy as np
 import pytest
 import torch
+from numcodecs.zstd import Zstd
 from plyfile import PlyData, PlyElement
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 from shared import gaussian_parameters
 
 import chebsplat.kernels.jit  # noqa: F401  # chooses the threading layer before gsply's numba
-from chebsplat.errors import InputError
+from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats import ply
-from chebsplat.formats.splats import READ, is_splat, read_splats
+from chebsplat.formats.splats import READ, is_splat, read_splats, write_splats
+from chebsplat.formats.world import World
 from chebsplat.splats.sh import basis
 
 N = 40
@@ -81,6 +87,124 @@ def test_spz_of_gsply_is_turned_into_the_axes_of_a_ply(tmp_path, degree):
     assert np.abs(colors[0] - colors[1]).max() < 0.6 / 128 * np.abs(seen).sum(1).max()
 
 
+def covariances(p):
+    turns = Rotation.from_quat(p["quats"], scalar_first=True).as_matrix()
+    return np.einsum("nij,nj,nkj->nik", turns, np.exp(2 * p["log_scales"]), turns)
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize(
+    ("suffix", "centre", "light"), [(".spz", 1 / 8, 1 / 64), (".sog", 3e-4, 1 / 80)]
+)
+def test_what_is_written_small_is_the_same_splat(tmp_path, suffix, centre, light, degree):
+    """In another order, by other axes of the same ellipsoids, in the source's own world."""
+    p = given(degree) | {"degrees": np.full(N, degree, np.uint8)}
+    p["quats"][0] = 0  # as renderers have it: no turn
+    world = World((4.0, -3.0, 2.0), 2.0)
+    write_splats(tmp_path / f"a{suffix}", p, world=world)
+    found, found_degree, labels = read_splats(tmp_path / f"a{suffix}")
+    assert (found_degree, labels) == (degree, None)
+    order = cKDTree(found["means"]).query(world.outward(p["means"]))[1]
+    assert sorted(order) == list(range(N))
+    found = {name: values[order] for name, values in found.items()}
+    assert np.abs(found["means"] - world.outward(p["means"])).max() < centre
+    p["quats"][0, 0] = 1
+    sizes = np.exp(2 * p["log_scales"].max(1) + 2 * np.log(world.scale))[:, None, None]
+    wanted = covariances(p | {"log_scales": p["log_scales"] + np.log(world.scale)})
+    assert (np.abs(covariances(found) - wanted) / sizes).max() < 0.1
+    assert np.abs(expit(found["logit_opacities"]) - expit(p["logit_opacities"])).max() < 0.51 / 255
+    assert np.abs(found["sh0"] - p["sh0"]).max() < 0.02
+    assert np.abs(found["shN"] - p["shN"]).max() < light + 1e-6
+
+
+def test_a_stray_gaussian_costs_others_nothing_and_a_far_scene_is_refused(tmp_path):
+    p = given() | {"degrees": np.full(N, 3, np.uint8)}
+    stray = p | {"means": np.concatenate([p["means"][:-1], [[1e7, 0, 0]]]).astype(np.float32)}
+    for name, parameters in (("a", p), ("b", stray)):
+        write_splats(tmp_path / f"{name}.spz", parameters)
+    near = [read_splats(tmp_path / f"{name}.spz")[0]["means"] for name in "ab"]
+    assert (cKDTree(near[1]).query(near[0])[0] == 0).sum() >= N - 1
+    for world in (World((4.5e7, 0, 0)), World((0, 0, 0), 1e4)):
+        with pytest.raises(DataFailure, match=r"does not fit; export it as \.ply"):
+            write_splats(tmp_path / "c.spz", p, world=world)
+    with pytest.raises(ConfigError, match="name it so"):
+        write_splats(tmp_path / "c.compressed.ply", p)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.spz", "b.spz"]
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"version": 1}, "version 1"),
+        ({"count": N + 1000}, "pixels for"),
+        ({"means": {"files": []}}, "is cut or no SOG"),
+        ({"sh0": {"codebook": [0.0], "files": ["sh0.webp"]}}, "is cut or no SOG"),
+        ({"quats": {"files": ["meta.json"]}}, "is cut or no SOG"),
+    ],
+)
+def test_a_sog_that_says_what_it_does_not_hold_is_refused(tmp_path, change, word):
+    write_splats(tmp_path / "a.sog", given() | {"degrees": np.full(N, 3, np.uint8)})
+    with (
+        zipfile.ZipFile(tmp_path / "a.sog") as whole,
+        zipfile.ZipFile(tmp_path / "b.sog", "w") as other,
+    ):
+        for name in whole.namelist():
+            content = whole.read(name)
+            if name == "meta.json":
+                content = json.dumps(json.loads(content) | change).encode()
+            other.writestr(name, content)
+    with pytest.raises(InputError, match=word):
+        read_splats(tmp_path / "b.sog")
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_spz_of_version_4_is_streams_of_zstd(tmp_path, degree):
+    """Written here by its specification, of what version 3 holds."""
+    p = given(degree) | {"degrees": np.full(N, degree, np.uint8)}
+    write_splats(tmp_path / "a.spz", p)
+    plain = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    widths = [9, 1, 3, 3, 4, *[3 * ply.REST[degree]] * (degree > 0)]
+    ends = 16 + N * np.cumsum(widths)
+    streams = [plain[end - N * width : end] for end, width in zip(ends, widths, strict=True)]
+    packed = [Zstd().encode(stream) for stream in streams]
+    sizes = [struct.pack("<QQ", len(a), len(b)) for a, b in zip(packed, streams, strict=True)]
+    header = struct.pack("<4sI", b"NGSP", 4) + plain[8:15]
+    header += struct.pack("<BI12x4x", len(streams), 36)  # four bytes of an extension
+    (tmp_path / "b.spz").write_bytes(header + b"".join([*sizes, *packed]))
+    ours, theirs = (read_splats(tmp_path / f"{name}.spz")[0] for name in "ab")
+    assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_glb_holds_what_gltf_asks_for_of_gaussians(tmp_path):
+    p = given(1) | {"degrees": np.ones(N, np.uint8)}
+    labels, world = np.arange(N) - 1, World((1.0, 2.0, 3.0), 2.0)
+    write_splats(tmp_path / "a.glb", p, labels, ["wall"], world)
+    raw = (tmp_path / "a.glb").read_bytes()
+    length, size = struct.unpack("<II", raw[8:16])
+    document, binary = json.loads(raw[20 : 20 + size]), raw[28 + size :]
+    assert length == len(raw) and document["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    mesh = document["meshes"][0]
+    held = {}
+    for name, k in mesh["primitives"][0]["attributes"].items():
+        view, kind = document["bufferViews"][k], document["accessors"][k]["componentType"]
+        part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+        held[name] = np.frombuffer(part, {5126: "<f4", 5123: "<u2"}[kind]).reshape(N, -1)
+    own = {name.removeprefix("KHR_gaussian_splatting:"): v for name, v in held.items()}
+    np.testing.assert_allclose(own["POSITION"], world.outward(p["means"]), rtol=1e-6)
+    np.testing.assert_allclose(own["SCALE"], 2 * np.exp(p["log_scales"]), rtol=1e-5)
+    np.testing.assert_allclose(own["ROTATION"], p["quats"][:, [1, 2, 3, 0]], atol=1e-6)
+    np.testing.assert_allclose(own["OPACITY"][:, 0], expit(p["logit_opacities"]), atol=1e-6)
+    for k in range(3):
+        assert np.array_equal(own[f"SH_DEGREE_1_COEF_{k}"], p["shN"][:, k])
+    assert not any("DEGREE_2" in name for name in own)
+    assert np.array_equal(own["_LABEL"][:, 0], labels) and mesh["extras"]["label_names"] == ["wall"]
+    white = (p["sh0"][:, 0] * 0.28209479 + 0.5).clip(0, 1)
+    shown = own["COLOR_0"] / 65535
+    display = np.where(shown > 0.0031308, 1.055 * shown ** (1 / 2.4) - 0.055, 12.92 * shown)
+    np.testing.assert_allclose(display[:, :3], white, atol=1e-3)
+    assert np.abs(shown[:, 3] - own["OPACITY"][:, 0]).max() < 1e-4
+
+
 def test_spz_of_version_2_holds_quaternions_of_three_bytes(tmp_path):
     """Written here by its specification."""
     p = given(0)
@@ -119,17 +243,20 @@ def test_a_splat_of_32_bytes_a_gaussian_reads(tmp_path):
     alike(found["quats"] / np.linalg.norm(found["quats"], axis=1, keepdims=True), p["quats"])
 
 
+def spz(version, n, degree):
+    return struct.pack("<4sIIBBBx", b"NGSP", version, n, degree, 12, 0)
+
+
 @pytest.mark.parametrize(("name", "content", "word"), [
     ("a.ksplat", b"any", "export it as PLY, for example with SuperSplat"),
-    ("a.SOG", b"any", r"\.sog is not read \(\.ply, \.spz, \.splat are\)"),
+    ("a.SOG", b"any", "is cut or no SOG of version 2"),
     ("a.splat", bytes(33), "no multiple of 32"),
     ("a.spz", b"any", "is cut or no SPZ"),
-    ("a.spz", struct.pack("<4sIIBBBx", b"NGSP", 4, 1, 0, 12, 0) + bytes(16),
-     r"\(b'NGSP', version 4\); export"),
-    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 1, 1, 0, 12, 0), mtime=0),
-     "no SPZ of version 2 or 3"),
-    ("a.spz", gzip.compress(struct.pack("<4sIIBBBx", b"NGSP", 3, 2**32 - 1, 3, 12, 0), mtime=0),
-     "is cut, or has more"),
+    ("a.spz", spz(4, 1, 0) + bytes(16), "is cut or no SPZ of version 2 to 4"),
+    ("a.spz", gzip.compress(spz(1, 1, 0), mtime=0), "version 1"),
+    ("a.spz", gzip.compress(spz(4, 1, 0), mtime=0), "version 4"),
+    ("a.spz", gzip.compress(spz(3, 2**32 - 1, 3), mtime=0), "it has more than"),
+    ("a.spz", gzip.compress(spz(3, 5, 3), mtime=0), "is cut"),
     ("a.spz", gzip.compress(bytes(9), mtime=0)[:-9], "no SPZ"),
 ])  # fmt: skip
 def test_what_is_no_splat_that_is_read_says_what_to_do(tmp_path, name, content, word):

@@ -350,7 +350,7 @@ def _scene(out: Path) -> None:
 
 def _evaluation(out: Path) -> None:
     (width, height), blank = SIZE, np.zeros((1, SIZE[1], SIZE[0], 3), np.uint8)
-    sizes = dict.fromkeys(("unpruned_ply", "ply", "split", "ragged", "semantic"), 100)
+    sizes = dict.fromkeys(("unpruned_ply", "ply", "spz", "ragged", "semantic"), 100)
     whole = {"miou": 0.5, "macc": 0.5, "oa": 0.5, "boundary_miou": None, "iou": {"wall": 0.5}}
     figures = {
         "names": VIEWS[:1],

@@ -71,7 +71,7 @@ def test_a_part_is_a_scene_and_a_ply(scene, tmp_path):
     part = scene.select(label=label, min_opacity=0.05)
     assert 0 < len(part) < len(scene)
     assert set(part.labels) == {scene.label_names.index(label)}
-    path = part.to_ply(tmp_path / "part.ply")
+    path = part.export(tmp_path / "part.ply")
     parameters, _, labels = read_ply(path)
     np.testing.assert_array_equal(parameters["means"], part.points()[0])
     np.testing.assert_array_equal(labels, part.labels)
@@ -79,7 +79,7 @@ def test_a_part_is_a_scene_and_a_ply(scene, tmp_path):
     half = scene.select(np.arange(len(scene)) % 2 == 0)
     assert len(half) == (len(scene) + 1) // 2
     with pytest.raises(ConfigError, match="exists"):
-        part.to_ply(path)
+        part.export(path)
 
 
 def test_what_cannot_be_is_said(scene):

@@ -39,7 +39,7 @@ def test_every_stage_of_a_scene_measures_its_error(toy):
     facts = {role: manifest.facts for role, manifest in made.items()}
     measured = {stage: figures_of(stage, facts) for stage in MEASURES if stage != "pose"}
     assert not [stage for stage, figures in measured.items() if not figures]
-    assert facts["evaluation"]["layouts"] == {"ragged": 0, "ply": 0, "split": 0}
+    assert facts["evaluation"]["layout_error"] == 0
     assert facts["capture"]["variance_kept"] == 1
     assert 0 < facts["points"]["depth_error"] < 0.03
     # three of ten segments bear another label
@@ -187,6 +187,6 @@ def test_a_layout_that_shows_another_picture_is_told(toy, tmp_path):
     scene = Scene.read(toy["export"])
     view = evaluate.camera(scene, 0)
     image = evaluate.SceneRenderer(scene.parameters).render(view)[0]
-    assert evaluate.layouts(job, scene, view, image) == {"ragged": 0, "ply": 0, "split": 0}
+    assert evaluate.layout_error(job, scene, view, image) == 0
     image[0, 0, 0] ^= 64
-    assert evaluate.layouts(job, scene, view, image) == {"ragged": 0, "ply": 64, "split": 64}
+    assert evaluate.layout_error(job, scene, view, image) == 64

@@ -119,7 +119,7 @@ def test_units_and_origin_change_neither_the_picture_nor_what_is_exported(scenes
     parts = plain.select(box=box.ravel()), opened.select(box=(origin + scale * box).ravel())
     assert len(parts[1]) == pytest.approx(len(parts[0]), rel=0.1)
     assert np.allclose(
-        places(parts[1].to_ply(tmp_path / "part.ply")), parts[1].points()[0], rtol=1e-6, atol=0
+        places(parts[1].export(tmp_path / "part.ply")), parts[1].points()[0], rtol=1e-6, atol=0
     )
 
 

@@ -16,10 +16,8 @@ import chebsplat
 from chebsplat.formats.packed import Packed, unpack
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.splats import read_splats
 from chebsplat.pipelines.cli import main
-
-# packages is a fixture
-from tests.formats.test_readers import CONVERSIONS, GRID, packages, transform  # noqa: F401
 from tests.stages.tools.test_page import held_in
 
 SCALE, SHIFT = 3.7, np.array([120.0, -45.0, 18.0])
@@ -77,9 +75,7 @@ def test_layouts_lie_where_the_checkpoint_does(moved):
     scene = Scene.read(export)
     close(scene.parameters["means"], wanted, 0)  # ragged arrays
     close(read_ply(export / "scene.ply")[0]["means"], wanted, 0)
-    split = [read_ply(path)[0]["means"] for path in sorted(export.glob("scene_d*.ply"))]
-    assert len(split) == 4
-    close(np.concatenate(split), wanted, 0)
+    close(read_splats(export / "scene.spz")[0]["means"], wanted, 0.06)
     np.testing.assert_array_equal(scene.cameras.cam_from_world, checkpoint.cameras.cam_from_world)
     sizes = np.exp(scene.parameters["log_scales"][np.argsort(scene.order)])
     np.testing.assert_allclose(sizes, np.exp(checkpoint.parameters["log_scales"]), rtol=1e-6)
@@ -89,10 +85,13 @@ def test_parts_pages_and_cameras_lie_there_too(moved, tmp_path):
     checkpoint, export = moved
     wanted = checkpoint.parameters["means"]
     scene = chebsplat.load(export)
-    close(read_ply(scene.to_ply(tmp_path / "python.ply"))[0]["means"], wanted, 0)
+    close(read_ply(scene.export(tmp_path / "python.ply"))[0]["means"], wanted, 0)
     for command, out in (("extract", "part.ply"), ("page", "page.html"), ("cameras", "cameras")):
         run(command, export, "--out", tmp_path / out)
     close(read_ply(tmp_path / "part.ply")[0]["means"], wanted, 0)
+    for kind, within in (("spz", 0.06), ("sog", 0.01)):
+        run("export", export, "--as", kind, "--out", tmp_path / f"a.{kind}")
+        close(read_splats(tmp_path / f"a.{kind}")[0]["means"], wanted, within)
     about, arrays = held_in(tmp_path / "page.html")
     held = unpack(
         Packed({name: arrays[name] for name in arrays if name != "views"}, about["ranges"])
@@ -158,14 +157,3 @@ def test_a_mesh_lies_there_too(mixed, moved, tmp_path):
         assert len(a) > 500
         # vertices of either are about a voxel apart
         assert np.median(cKDTree(b).query(a)[0]) < 0.75 * voxel
-
-
-@pytest.mark.slow
-@pytest.mark.xdist_group("readers")
-def test_spz_by_the_documented_converter_lies_there_too(moved, packages, tmp_path):  # noqa: F811
-    import gsply
-
-    checkpoint, export = moved
-    transform(packages, *CONVERSIONS["scene.spz"], export / "scene.ply", tmp_path / "scene.spz")
-    found = gsply.read_spz(tmp_path / "scene.spz").means * [1, -1, -1]  # SPZ looks along -z, y up
-    close(found, checkpoint.parameters["means"], 1.01 * np.sqrt(3) * GRID)

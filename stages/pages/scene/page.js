@@ -64,7 +64,8 @@ function legend() {
 // does, for words without a calibration, and labels, as chebsplat/labels/decode.py
 function unit_features(arrays) {
   const { n } = splats, C = about.ranges.features.step.length, rows = new Float32Array(n * C), lengths = new Float32Array(n);
-  for (let c = 0; c < C; c++) for (let k = 0; k < n; k++) rows[k * C + c] = arrays.features[c * n + k] * about.ranges.features.step[c];
+  const { features: dictionary, meanings } = arrays, R = dictionary.length / C; // each Gaussian says which row it means
+  for (let k = 0; k < n; k++) for (let c = 0; c < C; c++) rows[k * C + c] = dictionary[c * R + meanings[k]] * about.ranges.features.step[c];
   for (let k = 0; k < n; k++) {
     let sum = 0; for (let i = k * C; i < (k + 1) * C; i++) sum += rows[i] * rows[i];
     lengths[k] = Math.sqrt(sum); for (let i = k * C; i < (k + 1) * C; i++) rows[i] /= Math.max(lengths[k], 1e-6);

@@ -1,5 +1,8 @@
 """What is exported renders as the checkpoint does, and a part of a scene is chosen as asked."""
 
+import json
+import struct
+
 import numpy as np
 import pytest
 import torch
@@ -9,12 +12,15 @@ from shared import data
 
 from chebsplat.formats.ply import read_ply, write_ply
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.splats import read_splats
+from chebsplat.pipelines.api import load
 from chebsplat.pipelines.cli import main
 from chebsplat.rasterize import rasterize
 from chebsplat.render import SceneRenderer
 from chebsplat.splats.gaussians import activated
 from chebsplat.splats.sh import eval_sh
 from chebsplat.stages.evaluate import camera
+from chebsplat.stages.tools.up import up_of
 
 pytestmark = pytest.mark.xdist_group("toy")
 
@@ -44,13 +50,10 @@ def rendered(parameters, cameras, index):
 
 def test_the_exported_scene_renders_as_the_checkpoint_does(mixed):
     checkpoint, path = mixed
-    parts = [read_ply(file)[0] for file in sorted(path.glob("scene_d*.ply"))]
-    assert len(parts) == 4
-    together = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     for index in range(0, len(checkpoint.cameras.names), 3):
         wanted = rendered(checkpoint.parameters, checkpoint.cameras, index)
         assert wanted.max() > 0.3
-        for found in (Scene.read(path).parameters, read_ply(path / "scene.ply")[0], together):
+        for found in (Scene.read(path).parameters, read_ply(path / "scene.ply")[0]):
             image = rendered(found, checkpoint.cameras, index)
             assert (image - wanted).abs().max() < 1e-4  # only the order of equal depths may differ
 
@@ -63,16 +66,14 @@ def test_the_renderer_that_evaluates_by_degree_agrees(mixed):
     assert np.abs(image - wanted).max() <= 0.5 / 255 + 1e-4
 
 
-def test_a_quarter_of_each_degree_costs_at_most_what_the_bar_allows(mixed):
-    scene = Scene.read(mixed[1])
-    n, counts = len(scene.order), np.bincount(scene.parameters["degrees"])
-    split = sum(file.stat().st_size for file in mixed[1].glob("scene_d*.ply"))
-    floats = sum(
-        count * (17 + 3 * ((degree + 1) ** 2 - 1) + 2) for degree, count in enumerate(counts)
-    )
-    assert scene.summary["bytes"]["split"] == split
-    assert floats * 4 < split < floats * 4 + 4 * 2500  # headers
-    assert scene.summary["bytes"]["unpruned_ply"] == n * 62 * 4
+def test_what_is_shared_is_small(mixed):
+    sizes, n = Scene.read(mixed[1]).summary["bytes"], len(Scene.read(mixed[1]).order)
+    files = {name: mixed[1] / f"scene.{name}" for name in ("ply", "spz")}
+    assert {name: sizes[name] for name in files} == {
+        name: file.stat().st_size for name, file in files.items()
+    }
+    assert sizes["unpruned_ply"] == n * 62 * 4 > 8 * sizes["spz"]
+    assert not list(mixed[1].glob("scene_d*"))
 
 
 def run(*arguments):
@@ -134,14 +135,57 @@ def test_a_filter_that_makes_no_sense_is_an_error(mixed, tmp_path, arguments, co
     assert message in done.stderr
 
 
-def test_nothing_of_the_user_s_is_overwritten_and_other_formats_name_their_tool(mixed, tmp_path):
+def test_nothing_of_the_user_s_is_overwritten_and_other_formats_are_refused(mixed, tmp_path):
     (tmp_path / "a.ply").write_text("mine")
     assert run(mixed[1], "--out", tmp_path / "a.ply").exit_code == 2
     assert (tmp_path / "a.ply").read_text() == "mine"
-    for name in ("a.spz", "a.compressed.ply"):
+    for name in ("a.ksplat", "a.compressed.ply"):
         done = run(mixed[1], "--out", tmp_path / name)
         assert done.exit_code == 2
-        assert "splat-transform" in done.stderr
+        assert "name it so" in done.stderr
+
+
+@pytest.mark.parametrize("kind", ["ply", "spz", "sog", "glb"])
+def test_a_scene_leaves_as_one_file_that_stands_upright_where_asked(
+    mixed, tmp_path, kind, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    scene = load(mixed[1])
+    done = CliRunner().invoke(main, ["export", str(mixed[1]), "--as", kind])
+    path = tmp_path / f"{mixed[1].name}.{kind}"
+    assert done.exit_code == 0, done.stderr
+    assert f"bytes {path.stat().st_size:,}" in done.stderr
+    assert CliRunner().invoke(main, ["export", str(mixed[1]), "--as", kind]).exit_code == 2
+    flat = [
+        "export",
+        "--as",
+        kind,
+        str(mixed[1]),
+        "--up",
+        "x",
+        "--out",
+        str(tmp_path / f"b.{kind}"),
+    ]
+    assert CliRunner().invoke(main, flat).exit_code == 0
+    if kind == "glb":
+        plain, turned = (positions(tmp_path / name) for name in (path.name, "b.glb"))
+        up = up_of("auto", scene.parameters, scene.exported.cameras.cam_from_world)
+        heights = scene.parameters["means"] @ up, scene.parameters["means"][:, 0]
+        for found, height in zip((plain[:, 1], turned[:, 1]), heights, strict=True):
+            np.testing.assert_allclose(np.sort(found), np.sort(height), atol=1e-4)
+        return
+    plain, turned = (read_splats(tmp_path / name)[0] for name in (path.name, f"b.{kind}"))
+    images = [rendered(p, scene.exported.cameras, 0).clamp(0, 1) for p in (plain, scene.parameters)]
+    assert (images[0] - images[1]).square().mean() < 10**-3.5
+    heights = np.sort(-turned["means"][:, 1]), np.sort(scene.parameters["means"][:, 0])
+    np.testing.assert_allclose(*heights, atol=0.05)
+
+
+def positions(path):
+    raw = path.read_bytes()
+    start = 28 + struct.unpack("<I", raw[12:16])[0]
+    n = json.loads(raw[20 : start - 8])["accessors"][0]["count"]
+    return np.frombuffer(raw[start : start + 12 * n], "<f4").reshape(n, 3)
 
 
 @pytest.mark.data
@@ -162,4 +206,4 @@ def test_files_of_others_come_back_unchanged(tmp_path, name, of):
 def test_what_was_left_out_is_listed(toy):
     summary = Scene.read(toy["export"]).summary
     assert summary["left_out"]["lifted start of features"]
-    assert set(summary["bytes"]) == {"unpruned_ply", "ply", "split", "ragged", "semantic"}
+    assert set(summary["bytes"]) == {"unpruned_ply", "ply", "spz", "ragged", "semantic"}
