@@ -142,7 +142,7 @@ ROOMS = {
         "running": {"planning", "work"},
         "bases": {"planning", "running", "work"},
         "studies": {"planning", "running", "work"},
-        "selection": {"bases", "planning"},
+        "selection": {"bases", "planning", "work"},
         "api": {"running", "selection", "work"},
         "cli": {"api", "bases", "planning", "running", "selection", "studies", "work"},
     },
@@ -237,7 +237,9 @@ def test_tools_that_walk_the_links_see_each_file_once(tmp_path):
         for module in finder.find_modules_recursive("chebsplat")
         if module.path
     ]
-    assert sorted(path for path in typed if path.suffix == ".py") == sorted(SOURCES)
+    # for the package's own names mypy reads the stub beside them
+    seen = [path.with_suffix(".py") for path in typed if path.suffix in (".py", ".pyi")]
+    assert sorted(seen) == sorted(SOURCES)
     command = [sys.executable, "-P", "-m", "coverage"]
     traced = os.environ | {"COVERAGE_FILE": str(tmp_path / "data")}
     for words in (
