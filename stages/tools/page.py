@@ -33,7 +33,7 @@ from chebsplat.stages.tools.query import (
     teacher_of,
     understood,
 )
-from chebsplat.stages.tools.up import Up, up_of
+from chebsplat.stages.tools.up import Up, up_of, up_of_room
 
 log = logging.getLogger("chebsplat")
 
@@ -155,8 +155,8 @@ def foreign(ply: Path, up: Up | None = None, world: World | None = None) -> Scen
     """A scene of a splat from elsewhere: no semantics, one upright camera on its middle half.
     world: to transform it into, from that of its source; None: a suitable one.
 
-    Raises: InputError naming the file. Choices: without `up` it is -y, as in COLMAP's and 3DGS' own
-      frames.
+    Raises: InputError naming the file. Choices: without `up` it is by the shape of a room, or -y, as
+      in COLMAP's and 3DGS' own frames, where the splat is none.
     """
     target = world or HERE
     parameters, degree, _ = read_splats(ply, target)
@@ -170,8 +170,9 @@ def foreign(ply: Path, up: Up | None = None, world: World | None = None) -> Scen
     means = parameters["means"]
     low, high = np.quantile(means.astype(np.float64), (0.25, 0.75), axis=0)
     pose = np.eye(4)
-    if up is not None:
-        down = -up_of(up, parameters)
+    against_gravity = up_of_room(parameters) if up is None else up_of(up, parameters)
+    if against_gravity is not None:
+        down = -against_gravity
         # along y where z is up, along z as in COLMAP otherwise
         ahead = np.eye(3)[1 if abs(down[2]) > 0.9 else 2]
         ahead = ahead - (ahead @ down) * down

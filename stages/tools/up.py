@@ -36,14 +36,7 @@ def up_of(
         if sure >= LEAST_SURE:
             log.info("up is %s, by the cameras (--up auto)", format_up(up))
             return up
-    scales = np.sort(np.exp(parameters["log_scales"].astype(np.float64)), 1)
-    flat = (1 - scales[:, 0] / scales[:, 1].clip(1e-30)) * scales[:, 1] * scales[:, 2]
-    weights = flat.clip(0, np.quantile(flat, 0.98)) * expit(
-        parameters["logit_opacities"].astype(np.float64)
-    )
-    up, boxed, lean = room_up(
-        parameters["means"].astype(np.float64), surface_of(parameters)[0], weights + 1e-12
-    )
+    up, boxed, lean = measure_room(parameters)
     if poses is not None and len(poses) > 1:
         tops = float(-poses[:, 1, :3].mean(0) @ up)
         if abs(tops) > LEAST_SURE:
@@ -57,6 +50,24 @@ def up_of(
         )
         return up
     log.info("up is %s, by the floor (--up auto)", format_up(up))
+    return up
+
+
+def measure_room(parameters: dict[str, np.ndarray]) -> tuple[np.ndarray, float, float]:
+    """`room_up` of Gaussians with these raw parameters, each weighed by its flat, opaque area."""
+    scales = np.sort(np.exp(parameters["log_scales"].astype(np.float64)), 1)
+    flat = (1 - scales[:, 0] / scales[:, 1].clip(1e-30)) * scales[:, 1] * scales[:, 2]
+    opacities = expit(parameters["logit_opacities"].astype(np.float64))
+    weights = flat.clip(0, np.quantile(flat, 0.98)) * opacities + 1e-12
+    return room_up(parameters["means"].astype(np.float64), surface_of(parameters)[0], weights)
+
+
+def up_of_room(parameters: dict[str, np.ndarray]) -> np.ndarray | None:
+    """Up of a splat that is clearly a room, unit [3]; None of any other."""
+    up, boxed, lean = measure_room(parameters)
+    if boxed < LEAST_BOXED or lean < LEAST_LEAN:
+        return None
+    log.info("up is %s, by the shape of the room (--up says otherwise)", format_up(up))
     return up
 
 

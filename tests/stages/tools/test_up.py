@@ -191,14 +191,16 @@ def run(*arguments):
 
 
 @pytest.mark.parametrize(
-    ("asked", "wanted"), [("z", [0, 0, 1]), ("-x", [-1, 0, 0]), ("auto", TURNS[0][:, 2])]
+    ("asked", "wanted"),
+    [("z", [0, 0, 1]), ("-x", [-1, 0, 0]), ("auto", TURNS[0][:, 2]), (None, TURNS[0][:, 2])],
 )
 def test_page_and_scene_of_a_splat_stand_upright(tmp_path, asked, wanted):
     ply = tmp_path / "theirs.ply"
     write_ply(ply, furnished(TURNS[0], np.random.default_rng(0)), 0)
-    run("page", ply, "--up", asked, "--out", tmp_path / "theirs.html")
+    choice = [] if asked is None else ["--up", asked]
+    run("page", ply, *choice, "--out", tmp_path / "theirs.html")
     np.testing.assert_allclose(held_in(tmp_path / "theirs.html")[0]["up"], wanted, atol=0.03)
-    run("lift", ply, "--up", asked, "--out", tmp_path / "made")
+    run("lift", ply, *choice, "--out", tmp_path / "made")
     held = Scene.read(tmp_path / "made/export")
     pose = held.cameras.cam_from_world[0]
     np.testing.assert_allclose(-pose[1, :3], wanted, atol=0.03)
