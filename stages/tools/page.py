@@ -155,8 +155,8 @@ def foreign(ply: Path, up: Up | None = None, world: World | None = None) -> Scen
     """A scene of a splat from elsewhere: no semantics, one upright camera on its middle half.
     world: to transform it into, from that of its source; None: a suitable one.
 
-    Raises: InputError naming the file. Choices: without `up` it is by the shape of a room, or -y, as
-      in COLMAP's and 3DGS' own frames, where the splat is none.
+    Raises: InputError naming the file. Choices: without `up` it follows the shape of a room; of any
+      other splat it is -y, as in COLMAP's and 3DGS' own frames.
     """
     target = world or HERE
     parameters, degree, _ = read_splats(ply, target)

@@ -47,11 +47,16 @@ def place(tmp_path_factory):
     return folder
 
 
-def typed(place, text, **names):
-    """Exit code and output of a command of a page, in the place, for these names instead."""
+def adapted(text, names):
+    """The words of a command of a page, with names of ours for those there."""
     for old, new in names.items():
         text = re.sub(rf"(?<![\w.-]){re.escape(old)}(?![\w-])", new, text)
-    parts = shlex.split(text)
+    return shlex.split(text)
+
+
+def typed(place, text, **names):
+    """Exit code and output of a command of a page, in the place."""
+    parts = adapted(text, names)
     run = (
         ["make", "-C", str(ROOT), *parts[1:]]
         if parts[0] == "make"
@@ -59,19 +64,20 @@ def typed(place, text, **names):
     )
     given = os.environ | {"CHEBSPLAT_WORK": str(place / "work"), "BROWSER": "true"}
     done = subprocess.run(run, cwd=place, capture_output=True, text=True, env=given, timeout=900)
-    return done.returncode, done.stdout + done.stderr, parts
+    return done.returncode, done.stdout + done.stderr
 
 
 def check(place, texts, **names):
     """All of them end well, and leave what their --out names; or a line asks for an extra."""
     wrong = []
     for text in texts:
-        out = re.search(r"--out (\S+)", text)
-        for old in () if out is None else (place / out[1], (place / out[1]).with_suffix(".npz")):
-            shutil.rmtree(old, ignore_errors=True) if old.is_dir() else old.unlink(missing_ok=True)
-        code, output, parts = typed(place, text, **names)
-        last = output.strip().splitlines()[-1] if output.strip() else ""
+        parts = adapted(text, names)
         out = place / parts[parts.index("--out") + 1] if "--out" in parts else None
+        for old in () if out is None else (out, out.with_suffix(".npz")):
+            shutil.rmtree(old, ignore_errors=True)
+            old.unlink(missing_ok=True)
+        code, output = typed(place, text, **names)
+        last = output.strip().splitlines()[-1] if output.strip() else ""
         missing = code != 0 and "pip install -e" in output
         if not missing and (code != 0 or not last or (out is not None and not out.exists())):
             wrong.append(f"{text}: exit {code}: {last}")
@@ -85,17 +91,17 @@ def test_who_has_photos_gets_a_scene_of_colours_and_is_told_how_to_name_it(place
     texts = [text for text in commands("README.md") if "path/to/folder" in text]
     assert len(texts) == 2
     for text in texts:
-        code, output, _ = typed(place, f"{text} set={PHOTO_STEPS}", **{"path/to/folder/": photos})
+        code, output = typed(place, f"{text} set={PHOTO_STEPS}", **{"path/to/folder/": photos})
         assert code == 0, output[-2000:]
     assert re.search(r"report.*\.html", output) and "teacher" in output
-    code, output, _ = typed(place, "chebsplat query photos sofa")
+    code, output = typed(place, "chebsplat query photos sofa")
     assert code == 2 and "get-teacher" in output
 
 
 @pytest.fixture(scope="module")
 def named(place):
     """The place, with the named scene run and a splat beside as somebody else would send it."""
-    code, output, _ = typed(place, "make scene=toy")
+    code, output = typed(place, "make scene=toy")
     assert code == 0, output[-2000:]
     shutil.copy(place / "work/toy/export/scene.ply", place / "theirs.ply")
     return place
