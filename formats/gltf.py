@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
 
 from chebsplat.formats.packed import C0
 from chebsplat.formats.ply import REST
@@ -98,6 +97,8 @@ def write_splat_glb(
     Choices: glTF is y up and in metres: the caller rotates. Viewers without the extension draw
       points in COLOR_0. Labels are the attribute `_LABEL`, -1 for none, as in a mesh.
     """
+    from scipy.special import expit  # a command that only asks for help needs none
+
     means = world.outward(parameters["means"]).astype(np.float32)
     unit = parameters["quats"].astype(np.float64)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True).clip(1e-300)

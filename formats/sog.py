@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from scipy.special import expit
 
 from chebsplat.errors import InputError
 from chebsplat.formats.packed import OTHERS, along_a_curve, raw_parameters
@@ -35,6 +34,8 @@ def write_sog(
       Gaussians, in the finest steps from LIGHT_STEP on that give at most MOST_LIGHTS: pruned
       Gaussians share one row.
     """
+    from scipy.special import expit
+
     means = world.outward(parameters["means"]).astype(np.float64)
     order = along_a_curve(means)
     quats, log_scales = least_turned(

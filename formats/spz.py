@@ -12,8 +12,6 @@ from pathlib import Path
 
 import numpy as np
 from numcodecs.zstd import Zstd
-from scipy.spatial.transform import Rotation
-from scipy.special import expit
 
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats.packed import along_a_curve, drawn_near, raw_parameters
@@ -48,6 +46,8 @@ def write_spz(
       rotation is written: its quaternions have less entropy. Bits without a visible effect are
       zero, for gzip. A distant Gaussian is drawn nearer, as in `packed.pack`.
     """
+    from scipy.special import expit
+
     means, log_scales = drawn_near(
         world.outward(parameters["means"]), parameters["log_scales"] + np.log(world.scale)
     )
@@ -89,6 +89,8 @@ def least_turned(quats: np.ndarray, log_scales: np.ndarray) -> tuple[np.ndarray,
     """The same Gaussians by other axes: unit quaternions [N, 4] (wxyz) of the smallest rotation,
     and the log-scales [N, 3] along its axes.
     """
+    from scipy.spatial.transform import Rotation
+
     unit = quats.astype(np.float64)
     unit[np.linalg.norm(unit, axis=1) == 0] = [1, 0, 0, 0]  # as renderers have it
     turns = Rotation.create_group("O")

@@ -13,7 +13,7 @@ from shared import ROOT, data, photo_folder, remember
 from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.planning import forecast as forecasts
-from chebsplat.pipelines.planning.forecast import SECONDS, forecast, known, sentence
+from chebsplat.pipelines.planning.forecast import SECONDS, facts_of, forecast, sentence
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.work import store
 from chebsplat.stages.registry import STAGES
@@ -83,7 +83,7 @@ def test_more_work_is_expected_to_take_longer(more, fewer):
 
 
 def test_a_training_by_the_clock_takes_what_it_is_given():
-    assert SECONDS["train"](known(sections("office0", "train.seconds=600"))) == 600
+    assert SECONDS["train"](facts_of(sections("office0", "train.seconds=600"))) == 600
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_a_folder_whose_photos_cannot_be_read_has_no_forecast_and_says_so(tmp_pa
 
 def finished(scene, factor, threads=2, load=0.5):
     """Links in work of a scene whose stages have taken `factor` times what is expected of them."""
-    of = known(sections(scene))
+    of = facts_of(sections(scene))
     for step in Planner().plan(scene).steps:
         stage = STAGES[step.stage]
         seconds = factor * SECONDS[step.stage](of)
