@@ -14,6 +14,15 @@ from chebsplat.pipelines.cli.group import VERBOSELY, Guarded, log_to_stderr, say
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.stopping import streams
 
+SECTIONS = {  # of the list of commands; the stages follow
+    "Run": ("run", "plan", "study", "status", "scenes", "settings"),
+    "Look": ("view", "page", "render"),
+    "Ask": ("query", "calibrate"),
+    "Take": ("export", "extract", "mesh", "cameras", "label", "lift"),
+    "Teach": ("get-teacher", "check-teacher", "teach", "knowledge"),
+    "Keep": ("ls", "verify", "rm", "clean-stale"),
+}
+
 
 class Commands(Guarded):
     """Lists stages from their table and imports one when it is called: --help stays instant."""
@@ -28,6 +37,16 @@ class Commands(Guarded):
 
     def list_commands(self, context: click.Context) -> list[str]:
         return [*(name for name in super().list_commands(context) if name not in STAGES), *STAGES]
+
+    def format_commands(self, context: click.Context, formatter: click.HelpFormatter) -> None:
+        """The list of commands, by what a user wants."""
+        stages = {"Stages": tuple(name for name in STAGES if name not in self.commands)}
+        for title, names in (SECTIONS | stages).items():
+            commands = [(name, self.get_command(context, name)) for name in names]
+            width = formatter.width - 20
+            rows = [(name, of.get_short_help_str(width)) for name, of in commands if of]
+            with formatter.section(title):
+                formatter.write_dl(rows, col_max=18)
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
         # for the listing, which shows a name and a line

@@ -2,6 +2,7 @@
 so.
 """
 
+import re
 import subprocess
 import sys
 
@@ -13,6 +14,7 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.work.scenes import ONE, names, read_toml
+from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime import progress
 from chebsplat.stages.runtime.config import known_keys
 
@@ -111,3 +113,10 @@ def test_make_says_the_code_that_it_cannot_leave_with():
     )
     assert done.returncode == 2  # GNU make's own, whatever failed
     assert "not a folder" in done.stderr and "Error 3" in done.stderr
+
+
+def test_help_lists_every_command_once_by_what_a_user_wants():
+    shown = CliRunner().invoke(main, ["--help"]).output
+    listed = re.findall(r"^  ([a-z-]+)  ", shown.partition("\nRun:")[2], re.MULTILINE)
+    visible = {name for name, command in main.commands.items() if not command.hidden}
+    assert sorted(listed) == sorted(visible | set(STAGES))
