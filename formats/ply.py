@@ -187,15 +187,18 @@ def drop_unusable(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """The parameters of finite Gaussians, and the mask [N] of these; a warning counts the rest.
 
-    Raises:  InputError where more than MOST_UNUSABLE are not.
+    Raises:  InputError where there is none, or more than MOST_UNUSABLE are not finite.
     Choices: an infinite logit, which converters write for 8-bit opacities of exactly 0 or 1,
       becomes ±20: the same opacity in float32. A scale of 0, -inf as its logarithm, is left out:
-      nothing can be computed of it.
+      nothing can be computed of it. A quaternion of 0 is no rotation, as renderers have it.
     """
-    logits = parameters["logit_opacities"]
+    logits, quats = parameters["logit_opacities"], parameters["quats"]
+    if not len(logits):
+        raise InputError(f"{path} holds no Gaussians; choose another")
     infinite = np.isinf(logits)
     parameters = parameters | {
-        "logit_opacities": np.where(infinite, np.copysign(np.float32(20), logits), logits)
+        "logit_opacities": np.where(infinite, np.copysign(np.float32(20), logits), logits),
+        "quats": np.where(quats.any(1, keepdims=True), quats, np.array([1, 0, 0, 0], np.float32)),
     }
     finite = {
         name: np.isfinite(values).reshape(len(values), -1).all(1)

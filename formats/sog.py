@@ -123,6 +123,8 @@ def read_sog(path: Path) -> tuple[dict[str, np.ndarray], int]:
             meta = json.loads(whole.read("meta.json"))
             if meta["version"] != 2:
                 raise ValueError(f"version {meta['version']}")
+            if meta["count"] < 0:
+                raise ValueError(f"{meta['count']} Gaussians")
 
             def picture(of: str, which: int = 0) -> np.ndarray:
                 content = whole.read(meta[of]["files"][which])
@@ -136,8 +138,10 @@ def read_sog(path: Path) -> tuple[dict[str, np.ndarray], int]:
                 return whole_numbers
 
             def values(of: str, entries: np.ndarray) -> np.ndarray:
-                levels: np.ndarray = np.array(meta[of]["codebook"], np.float64)[entries]
-                return levels
+                levels = np.array(meta[of]["codebook"], np.float64)
+                if levels.ndim != 1:
+                    raise ValueError(f"{of} has no codebook of numbers")
+                return np.asarray(levels[entries])
 
             fixed = pixels("means")[:, :3] | pixels("means", 1)[:, :3] << 8
             low, high = (np.array(meta["means"][side]) for side in ("mins", "maxs"))

@@ -75,7 +75,7 @@ def _fraction_bits(means: np.ndarray, log_scales: np.ndarray) -> int:
     needed = np.ceil(np.log2(FINE) - np.median(log_scales.min(1)) / np.log(2)).clip(0, 23)
     fitting = np.floor(np.log2((2**23 - 1) / np.abs(means).max().clip(1)))
     low, high = np.quantile(means, (0.05, 0.95), axis=0)
-    coarse = fitting < needed and 2**fitting * (high - low).max() < LEAST_STEPS
+    coarse = fitting < 0 or (fitting < needed and 2**fitting * (high - low).max() < LEAST_STEPS)
     largest = log_scales.max(1)
     if coarse or ((largest < -10) | (largest > 255 / 16 - 10)).mean() > MOST_CUT:
         raise DataFailure(
@@ -156,7 +156,7 @@ def read_spz(path: Path) -> tuple[dict[str, np.ndarray], int]:
         quats * [1, 1, -1, -1],
         planes["alphas"][:, 0],
         (planes["colors"] / 255 - 0.5) / 0.15,
-        (planes["sh"].reshape(n, -1, 3).astype(np.float32) / 128 - 1)
+        (planes["sh"].reshape(n, REST[degree], 3).astype(np.float32) / 128 - 1)
         * TURNED[: REST[degree], None],
     ), degree
 

@@ -45,11 +45,11 @@ def run(job: Job) -> None:
         job.left_out("labels", "no --in-features: the label embeddings are unknown")
     else:
         teacher = Features.read(job.inputs["features"])
-        parameters["features"] = shared_features(semantic[order])
         if semantic.shape[1] != teacher.label_embeddings.shape[1]:
             raise InputError(
                 f"{job.inputs['features']} has other channels than the checkpoint; pass its own"
             )
+        parameters["features"] = shared_features(semantic[order])
         labels = decode_labels(parameters["features"], teacher.label_embeddings).astype(np.int32)
         labels[~parameters["features"].any(1)] = -1
         labelled = {

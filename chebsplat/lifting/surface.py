@@ -162,7 +162,9 @@ def room_up(
 
 
 def lean(share: np.ndarray, height: np.ndarray, mask: np.ndarray) -> float:
-    """Share [N] of what is in the mask that lies in the lower half, less that in the upper one."""
+    """The part of the masked surface in the lower half less that in the upper one, in [-1, 1];
+    share [N]: of all surface that each Gaussian has.
+    """
     total = float(share[mask].sum())
     return (2 * float(share[mask & (height < 0.5)].sum()) - total) / max(total, 1e-30)
 

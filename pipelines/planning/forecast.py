@@ -129,11 +129,13 @@ class Forecast:
         return sum(self.seconds.values()) + BEGIN * len(self.seconds)
 
 
-def facts_of(stages: Mapping[str, dict[str, Any]], fewer: int | None = None) -> SceneFacts | None:
+def facts_of(
+    stages: Mapping[str, dict[str, Any]], semantic: bool, fewer: int | None = None
+) -> SceneFacts | None:
     """Facts of a scene by its settings and source; None where no photo can be read.
 
-    Args: stages: sections of the config by stage, of a plan or of a finished scene; fewer: photos,
-      in the place of more.
+    Args: stages: sections of the config by stage, of a plan or of a finished scene; semantic: the
+      training reads features; fewer: photos, in the place of more.
     """
     ingest = stages["ingest"]["ingest"]
     source, pose = stages["ingest"]["source"], stages.get("pose", {}).get("pose", {})
@@ -159,7 +161,7 @@ def facts_of(stages: Mapping[str, dict[str, Any]], fewer: int | None = None) -> 
             train.get("seconds"),
             train.get("max_gaussians", 0),
             train.get("method") == "printed",
-            bool(teacher) and train.get("features") == "trained",
+            semantic,
             teacher.get("model") is not None,
         )
     return None
@@ -200,7 +202,8 @@ def rates(cores: int, device: str) -> dict[str, float]:
             with suppress(InputError):  # damaged: nothing can be learnt of it
                 manifests[stage] = parse_manifest(path)
         try:
-            of = facts_of({stage: manifest.config for stage, manifest in manifests.items()})
+            semantic = "train" in manifests and "features" in manifests["train"].inputs
+            of = facts_of({stage: made.config for stage, made in manifests.items()}, semantic)
         except KeyError:  # of a study, or made by another version, with other settings
             continue
         for stage in manifests.keys() & SECONDS:
@@ -237,7 +240,8 @@ def idle_seconds(manifest: Manifest) -> float:
 def forecast(plan: Plan, steps: Iterable[Step], cores: int, device: str) -> Forecast | None:
     """Forecast of `steps` of a plan, which are to run; None where no photo can be read."""
     sections = {step.stage: step.sections for step in plan.steps}
-    now, stages = facts_of(sections), [step.stage for step in steps]
+    semantic = any(step.stage == "train" and "features" in step.inputs for step in plan.steps)
+    now, stages = facts_of(sections, semantic), [step.stage for step in steps]
     if now is None:
         return None
     factors = rates(cores, device)
@@ -246,7 +250,8 @@ def forecast(plan: Plan, steps: Iterable[Step], cores: int, device: str) -> Fore
         return {stage: SECONDS[stage](of) * factors[stage] for stage in stages}
 
     expected, saved = seconds(now), 0.0
-    if now.photos > MANY and (fewer := facts_of(sections, MANY)):
+    # of photos that are read already, fewer would be read anew
+    if "ingest" in stages and now.photos > MANY and (fewer := facts_of(sections, semantic, MANY)):
         saved = sum(expected.values()) - sum(seconds(fewer).values())
     size = sum(MEGABYTES[stage](now) for stage in stages if stage in MEGABYTES)
     return Forecast(now.photos, expected, size, saved)

@@ -98,7 +98,7 @@ def left_out_stages(config: Any, kind: str, why: str, probe: dict[str, bool]) ->
         reason = (
             "the printed method ends with its training"
             if printed
-            else ("refine is asked for nothing")
+            else "refine is asked for nothing"
         )
         left_out |= {"lift": reason, "refine": reason}
     if config.source.kind not in POSELESS:
@@ -192,7 +192,7 @@ def source_sentence(name: str, setting: Any, source: Any) -> str:
         note = (
             " (REPLICA_ROOT has no such scene)"
             if os.environ.get("REPLICA_ROOT")
-            else (" (REPLICA_ROOT is not set)")
+            else " (REPLICA_ROOT is not set)"
         )
     return f"generated scene {name}: preset {source.preset}, seed {source.seed}{note}"
 

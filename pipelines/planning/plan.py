@@ -282,10 +282,8 @@ class Planner:
                 inputs.pop("lesson", None)  # its own lesson, which is for later scenes
                 inputs |= lesson_paths(self._lessons(place, scene, start, identity, lessons))
                 if inputs.keys() == {"start"}:
-                    store_inputs["knowledge"], left_out["recall"] = (
-                        inputs["start"],
-                        ("no lesson to add to what ships"),
-                    )
+                    store_inputs["knowledge"] = inputs["start"]
+                    left_out["recall"] = "no lesson to add to what ships"
                     continue
             keys = {role: path.name for role, path in inputs.items()}
             without = stage.name == "train" and "features" not in inputs

@@ -85,10 +85,8 @@ def holder(artifact: Path) -> Path | None:
 
 def unknown_scene(scene: str) -> ConfigError | InputError:
     """The error for a scene that is not there, with the nearest names."""
-    where, run = (
-        f"no finished scene in {store.work()}",
-        (f"run it first: make scene={quote(escape_text(scene))}"),
-    )
+    where = f"no finished scene in {store.work()}"
+    run = f"run it first: make scene={quote(escape_text(scene))}"
     if is_splat(path := os.path.expanduser(scene)) and os.path.exists(path):
         return InputError(
             f"{escape_text(scene)} is a splat and {where}; make one of it: chebsplat lift "

@@ -129,16 +129,16 @@ def _mapped(
     options.num_threads, options.random_seed = 1, seed
     out = job.scratch / "mapped"
     out.mkdir(exist_ok=True)
-    registered = job.progress.ticker(len(shots), "poses")
+    with job.progress.ticker(len(shots), "poses") as registered:
 
-    def first_pair() -> None:
-        registered()
-        registered()
+        def first_pair() -> None:
+            registered()
+            registered()
 
-    models = pycolmap.incremental_mapping(
-        database, pictures, out, options,
-        initial_image_pair_callback=first_pair, next_image_callback=registered,
-    )  # fmt: skip
+        models = pycolmap.incremental_mapping(
+            database, pictures, out, options,
+            initial_image_pair_callback=first_pair, next_image_callback=registered,
+        )  # fmt: skip
     if not models:
         return None
     sizes = sorted((model.num_reg_images() for model in models.values()), reverse=True)

@@ -10,7 +10,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
@@ -107,9 +107,10 @@ class Progress:
         if self._log is not None:
             self._log.write(json.dumps(values) + "\n")
 
-    def ticker(self, total: int, what: str) -> Callable[[], None]:
-        """A function to call after each of `total` steps of a library's loop; further calls have no
-        effect.
+    @contextmanager
+    def ticker(self, total: int, what: str) -> Iterator[Callable[[], None]]:
+        """A function to call after each of `total` steps of a library's loop, which may be fewer;
+        further calls have no effect.
         """
         steps = self.track(range(total), total, what)
         next(steps, None)
@@ -117,17 +118,20 @@ class Progress:
         def tick() -> None:
             next(steps, None)
 
-        return tick
+        yield tick
+        steps.close()
 
     def track(
         self, items: Iterable[T], total: int | Callable[[], int], what: str, start: int = 0
-    ) -> Iterator[tuple[T, dict[str, Any]]]:
+    ) -> Generator[tuple[T, dict[str, Any]], None, None]:
         """Yield (item, status); the caller's entries in `status` are shown beside rate and time
         left.
 
         total: number of items, `start` of them done before; a function where it changes on the way.
         """
         status: dict[str, Any] = {}
+        if start:  # the forecast is of all the work, of which an earlier process has done a part
+            self.expected = None
         began = last = time.perf_counter()
         # the first item warms up and is not counted in the rate
         try:
@@ -148,4 +152,6 @@ class Progress:
                         self._bar + self._left(now - began, rest), end="\n" if at == n else ""
                     )
         finally:
+            if self.show and self._bar and index + start + 1 < n:
+                print(file=sys.stderr, flush=True)  # nothing is written over an unfinished bar
             self._bar = ""

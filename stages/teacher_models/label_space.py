@@ -11,7 +11,7 @@ import numpy as np
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.teacher_model import read_label_set, read_label_table
-from chebsplat.labels.decode import class_codes, decode
+from chebsplat.labels.decode import IGNORE, class_codes, decode
 from chebsplat.labels.names import joined, lacking, rows_of
 from chebsplat.stages.teacher_models.text_encoder import text_embeddings
 
@@ -36,7 +36,7 @@ OUTDOORS = (
     "sidewalk", "sky", "skyscraper", "streetlight", "tent", "terrain", "tower", "traffic light",
     "traffic sign", "train", "tree", "truck", "van", "vegetation", "water", "waterfall",
 )  # fmt: skip
-# up to this share of OUTDOORS views are of a room: nine captures of rooms have .01 to .12
+# of a room where OUTDOORS have at most this share: nine captures of rooms have .01 to .12
 IN_A_ROOM = 0.3
 LEAST = 12  # of these words in a teacher's table; with fewer all words of the table are labels
 
@@ -126,8 +126,8 @@ def closed_set(
     Raises: InputError where names and channels differ in number, or a label has no class.
     Choices: a pixel's feature is the unit mean of the class codes (`chebsplat.labels.decode`),
       weighted by its probabilities, so that training is as for features; its label is the likeliest
-      class, its confidence that class's probability. Where the views are of a room, OUTDOORS are
-      left out, but for labels of the file: their pixels get the next likeliest class.
+      class, its confidence that class's probability. Where the views are of a room, OUTDOORS that
+      the file does not name are left out; their pixels get the next likeliest class.
     """
     from chebsplat.stages.teacher_models.image_encoder import unit
 
@@ -156,7 +156,8 @@ def closed_set(
 
     def split(maps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         of_names = maps @ merge
-        of_names /= of_names.sum(-1, keepdims=True).clip(1e-30)
-        return unit(of_names @ codes, -1), of_names.argmax(-1).astype(np.int16), of_names.max(-1)
+        confidence = of_names.max(-1)
+        labels = np.where(confidence > 0, of_names.argmax(-1), IGNORE).astype(np.int16)
+        return unit(of_names @ codes, -1), labels, confidence
 
     return LabelSpace(names, codes, split, left_out)

@@ -1,4 +1,4 @@
-"""Cameras to render a scene from: a flight along its capture's, an orbit, these, or a file's."""
+"""Cameras to render a scene from: a flight, an orbit, the capture's own, or a file's."""
 
 from __future__ import annotations
 
@@ -154,11 +154,10 @@ def draw_surface(parameters: dict[str, np.ndarray]) -> np.ndarray:
     """Points [N_DRAWN, 3] of Gaussians, drawn by their area and opacity, as far from their centres
     as they reach.
     """
-    scales = np.exp(parameters["log_scales"].astype(np.float64))
+    scales = np.exp(parameters["log_scales"].astype(np.float64).clip(-100, 100))
     area = np.sort(scales, 1)[:, 1:].prod(1)
-    weights = area.clip(0, np.quantile(area, 0.98)) * expit(
-        parameters["logit_opacities"].astype(np.float64)
-    )
+    opacities = expit(parameters["logit_opacities"].astype(np.float64))
+    weights = area.clip(0, np.quantile(area, 0.98)) * opacities + 1e-12
     rng = np.random.default_rng(0)
     rows = rng.choice(len(scales), N_DRAWN, p=weights / weights.sum())
     turns = Rotation.from_quat(parameters["quats"][rows], scalar_first=True)

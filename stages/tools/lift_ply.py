@@ -74,9 +74,9 @@ def lift_ply(
     cameras, world = cameras_of(capture, points), World.read(photos.source)
     surface = photos.points if points is None else Points.read(points).means
     original = read_splats(ply)[0] if world.notes else None
-    parameters = in_frame(
-        ply, foreign(ply, world=world).parameters, photos, cameras, surface, original
-    )
+    # the added camera is left out, so that its up is of no account
+    theirs = foreign(ply, np.array([0.0, -1, 0]), world).parameters
+    parameters = in_frame(ply, theirs, photos, cameras, surface, original)
     write_gaussians(ply, parameters, cameras, out, world)
     config = out / "settings.json"
     config.write_text(json.dumps({"train": {"features": "lifted"}}))
@@ -101,7 +101,7 @@ def lift_ply(
 def import_ply(ply: Path, out: Path, up: Up | None = None) -> dict[str, Any]:
     """A PLY as a scene without semantics, `gaussians` and `export` below `out`, with one camera.
 
-    Args: up: of that camera, and so of pages and orbits; None: -y.
+    Args: up: of that camera, and so of pages and orbits; None: by the shape of a room, else -y.
     Returns: counts. Raises: InputError on what cannot be read.
     """
     scene = foreign(ply, up)
@@ -186,8 +186,6 @@ def label_ply(
         near = ", ".join(suggest(word, prior.words))
         raise ConfigError(f"{knowledge} has no word {word}" + (f"; near: {near}" if near else ""))
     parameters, degree, _ = read_splats(ply)
-    if not len(parameters["means"]):
-        raise InputError(f"{ply} holds no Gaussians; choose another")
     up = up_of(up_option, parameters)
     unit = room_unit(parameters["means"]) if unit is None else unit
     poses, Ks = lookouts(

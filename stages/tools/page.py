@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from chebsplat.errors import ConfigError, InputError
+from chebsplat.errors import ConfigError
 from chebsplat.formats.calibration import calibration_of
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.files import atomic_path
@@ -153,17 +153,15 @@ def write_page(
 
 def foreign(ply: Path, up: Up | None = None, world: World | None = None) -> Scene:
     """A scene of a splat from elsewhere: no semantics, one upright camera on its middle half.
-    world: to transform it into, from that of its source; None: a suitable one.
 
-    Raises: InputError naming the file. Choices: without `up` it follows the shape of a room; of any
-      other splat it is -y, as in COLMAP's and 3DGS' own frames.
+    Args: up: None: by the shape of a room; of any other splat -y, as in COLMAP's and 3DGS' own
+      frames; world: to transform it into, from that of its source; None: a suitable one.
+    Raises: InputError naming the file.
     """
     target = world or HERE
     parameters, degree, _ = read_splats(ply, target)
     if world is None and (target := World.of(parameters["means"].astype(np.float64))) != HERE:
         parameters, degree, _ = read_splats(ply, target)
-    if not len(parameters["means"]):
-        raise InputError(f"{ply} holds no Gaussians; choose another")
     degrees = parameters.setdefault("degrees", np.full(len(parameters["means"]), degree, np.uint8))
     order = np.argsort(degrees, kind="stable")  # the order of renderers
     parameters = {name: values[order] for name, values in parameters.items()}

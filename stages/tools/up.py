@@ -42,12 +42,13 @@ def up_of(
         if abs(tops) > LEAST_SURE:
             up, lean = up * np.sign(tops), 1.0
     if boxed < LEAST_BOXED or lean < LEAST_LEAN:
-        log.warning(
-            "not sure which way is up: this does not look like a room (%.0f %% of its surface lies "
-            "across three directions at right angles); %s is taken; --up says",
-            100 * boxed,
-            format_up(up),
+        why = (
+            "nothing in it tells up from down"
+            if boxed >= LEAST_BOXED
+            else f"this does not look like a room ({100 * boxed:.0f} % of its surface lies across "
+            "three directions at right angles)"
         )
+        log.warning("not sure which way is up: %s; %s is taken, or give --up", why, format_up(up))
         return up
     log.info("up is %s, by the floor (--up auto)", format_up(up))
     return up
@@ -55,7 +56,7 @@ def up_of(
 
 def measure_room(parameters: dict[str, np.ndarray]) -> tuple[np.ndarray, float, float]:
     """`room_up` of Gaussians with these raw parameters, each weighed by its flat, opaque area."""
-    scales = np.sort(np.exp(parameters["log_scales"].astype(np.float64)), 1)
+    scales = np.sort(np.exp(parameters["log_scales"].astype(np.float64).clip(-100, 100)), 1)
     flat = (1 - scales[:, 0] / scales[:, 1].clip(1e-30)) * scales[:, 1] * scales[:, 2]
     opacities = expit(parameters["logit_opacities"].astype(np.float64))
     weights = flat.clip(0, np.quantile(flat, 0.98)) * opacities + 1e-12

@@ -140,6 +140,11 @@ def test_a_stray_gaussian_costs_others_nothing_and_a_far_scene_is_refused(tmp_pa
         ({"means": {"files": []}}, "is cut or no SOG"),
         ({"sh0": {"codebook": [0.0], "files": ["sh0.webp"]}}, "is cut or no SOG"),
         ({"quats": {"files": ["meta.json"]}}, "is cut or no SOG"),
+        ({"count": -3}, "-3 Gaussians"),
+        (
+            {"sh0": {"codebook": [[0.0, 1.0]] * 256, "files": ["sh0.webp"]}},
+            "no codebook of numbers",
+        ),
     ],
 )
 def test_a_sog_that_says_what_it_does_not_hold_is_refused(tmp_path, change, word):
@@ -315,3 +320,46 @@ def test_a_few_gaussians_that_are_not_finite_are_dropped_and_counted(tmp_path, c
     ply.write_ply(tmp_path / "a.ply", p, 3)
     with pytest.raises(InputError, match="means holds non-finite values in 35 rows"):
         read_splats(tmp_path / "a.ply")
+
+
+def emptied(path):
+    """A file of a format that holds no Gaussian, as its header says."""
+    if path.suffix == ".ply":
+        ply.write_ply(path, given(0), 0)
+        head = path.read_bytes().partition(b"end_header\n")[0]
+        path.write_bytes(head.replace(b"vertex %d" % N, b"vertex 0") + b"end_header\n")
+    elif path.suffix == ".spz":
+        path.write_bytes(gzip.compress(spz(3, 0, 1)[:16]))
+    elif path.suffix == ".splat":
+        path.write_bytes(b"")
+    else:
+        write_splats(path, given(0) | {"degrees": np.zeros(N, np.uint8)})
+        with zipfile.ZipFile(path) as whole:
+            files = {name: whole.read(name) for name in whole.namelist()}
+        meta = json.loads(files["meta.json"]) | {"count": 0}
+        with zipfile.ZipFile(path, "w") as whole:
+            for name, content in (files | {"meta.json": json.dumps(meta)}).items():
+                whole.writestr(name, content)
+    return path
+
+
+@pytest.mark.parametrize("suffix", READ)
+def test_a_file_without_gaussians_is_refused_as_such(tmp_path, suffix):
+    with pytest.raises(InputError, match="holds no"):
+        read_splats(emptied(tmp_path / f"none{suffix}"))
+
+
+def test_a_quaternion_of_zero_is_read_as_no_rotation(tmp_path):
+    p = given(0)
+    p["quats"][3] = 0
+    ply.write_ply(tmp_path / "a.ply", p, 0)
+    quats = read_splats(tmp_path / "a.ply")[0]["quats"]
+    np.testing.assert_array_equal(quats[3], [1, 0, 0, 0])
+    np.testing.assert_array_equal(np.delete(quats, 3, 0), np.delete(p["quats"], 3, 0))
+
+
+def test_a_scene_too_far_for_24_bits_is_refused_as_spz(tmp_path):
+    p = given(0) | {"degrees": np.zeros(N, np.uint8)}
+    p["means"] *= np.float32(1e8)
+    with pytest.raises(DataFailure, match="does not fit"):
+        write_splats(tmp_path / "far.spz", p)

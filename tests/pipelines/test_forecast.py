@@ -83,7 +83,7 @@ def test_more_work_is_expected_to_take_longer(more, fewer):
 
 
 def test_a_training_by_the_clock_takes_what_it_is_given():
-    assert SECONDS["train"](facts_of(sections("office0", "train.seconds=600"))) == 600
+    assert SECONDS["train"](facts_of(sections("office0", "train.seconds=600"), True)) == 600
 
 
 @pytest.mark.parametrize(
@@ -119,6 +119,19 @@ def test_many_photos_are_said_to_be_many_and_what_fewer_would_save(tmp_path):
     told = expected(folder, "pose.max_views=150")[1]
     assert told.photos == 150
     assert sum(told.seconds.values()) == pytest.approx(sum(found.seconds.values()) - found.saved)
+    last = [step for step in plan.steps if step.stage not in ("pose", "ingest")]
+    assert forecast(plan, last, 1, "cpu").saved == 0
+
+
+def test_a_training_that_reads_no_features_is_expected_to_be_one_of_colours():
+    seconds, megabytes = [], []
+    for settings in ("", "train.features=lifted", "teacher.kind=none"):
+        plan = Planner().plan("office0", settings)
+        training = [step for step in plan.steps if step.stage == "train"]
+        found = forecast(plan, training, 2, "cpu")
+        seconds.append(found.seconds["train"])
+        megabytes.append(found.megabytes)
+    assert seconds[1] == seconds[2] < seconds[0] and megabytes[1] == megabytes[2] < megabytes[0]
 
 
 def test_a_folder_whose_photos_cannot_be_read_has_no_forecast_and_says_so(tmp_path):
@@ -131,13 +144,14 @@ def test_a_folder_whose_photos_cannot_be_read_has_no_forecast_and_says_so(tmp_pa
 
 def finished(scene, factor, threads=2, load=0.5):
     """Links in work of a scene whose stages have taken `factor` times what is expected of them."""
-    of = facts_of(sections(scene))
+    of = facts_of(sections(scene), True)
     for step in Planner().plan(scene).steps:
         stage = STAGES[step.stage]
         seconds = factor * SECONDS[step.stage](of)
         machine = {"processor": processor(), "gpu": "", "cores": 2, "threads": threads}
         processes = [machine | {"load": [load, load], "seconds": seconds}]
-        manifest = Manifest(stage.schema, step.key, step.stage, config=step.sections)
+        inputs = {role: {"key": path.name, "schema": "s/1"} for role, path in step.inputs.items()}
+        manifest = Manifest(stage.schema, step.key, step.stage, inputs, config=step.sections)
         manifest.processes, manifest.seconds = processes, seconds
         step.path.mkdir(parents=True)
         (step.path / "artifact.json").write_text(json.dumps(asdict(manifest)))

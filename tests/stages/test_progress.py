@@ -47,11 +47,32 @@ def test_records_become_lines_of_json(tmp_path):
 
 
 def test_a_ticker_shows_what_a_library_counts_and_nothing_beyond_its_total(capsys):
-    tick = Progress(show=True).ticker(3, "poses")
-    for _ in range(5):
-        tick()
+    with Progress(show=True).ticker(3, "poses") as tick:
+        for _ in range(5):
+            tick()
     error = capsys.readouterr().err
     assert "poses 3/3" in error and "4/3" not in error and error.count("\n") == 1
+
+
+def test_a_ticker_of_fewer_steps_than_expected_leaves_no_bar(capsys):
+    progress = Progress(show=True, every=0.2)
+    with progress.alive():
+        with progress.ticker(10, "poses") as tick:
+            for _ in range(4):
+                time.sleep(0.25)
+                tick()
+        shown = capsys.readouterr().err
+        time.sleep(0.6)
+    assert "poses 4/10" in shown and shown.endswith("\n")
+    assert "poses" not in capsys.readouterr().err
+
+
+def test_work_that_is_resumed_tells_what_is_left_by_its_own_rate(caplog):
+    progress = Progress(show=False, every=0.0, expected=600)
+    with caplog.at_level(logging.INFO, "chebsplat"):
+        for _ in progress.track(range(90, 100), 100, "teacher", 90):
+            time.sleep(0.02)
+    assert "about 5 s left" in caplog.text and "min left" not in caplog.text
 
 
 @pytest.mark.parametrize("show", [False, True])
@@ -72,7 +93,7 @@ def test_a_bar_that_stands_still_shows_that_time_goes_on(capsys):
         for _ in progress.track(range(2), 3, "work"):
             time.sleep(0.9)
     error = capsys.readouterr().err
-    assert "\r\x1b[Kwork 1/3  1 s so far" in error and "\n" not in error
+    assert "\r\x1b[Kwork 1/3  1 s so far" in error and error.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,14 @@ import shlex
 import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 
 import pytest
 from PIL import Image
 from shared import ROOT, run_stage
 
 from chebsplat.formats.capture import Capture
+from chebsplat.formats.extras import EXTRAS
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("users")]
 COMMAND = re.compile(r"^    (?:\.venv/bin/)?((?:chebsplat|make) .*?)(?:\s+# .*)?$", re.MULTILINE)
@@ -23,6 +25,7 @@ ELSEWHERE = re.compile(
     r"sequence|device=|make (?:test|lint|lock|gpu|stability|setup|bench)|on=slurm|clean-stale| rm |"
     r"seconds=|-v run|stage=sfm"
 )
+ABSENT = {name for package, name in EXTRAS.items() if find_spec(package) is None}
 PHOTO_STEPS = "train.steps=150,sfm.max_points=4000"
 
 
@@ -73,12 +76,14 @@ def check(place, texts, **names):
     for text in texts:
         parts = adapted(text, names)
         out = place / parts[parts.index("--out") + 1] if "--out" in parts else None
+        assert out is None or out.resolve().is_relative_to(place)
         for old in () if out is None else (out, out.with_suffix(".npz")):
             shutil.rmtree(old, ignore_errors=True)
             old.unlink(missing_ok=True)
         code, output = typed(place, text, **names)
         last = output.strip().splitlines()[-1] if output.strip() else ""
-        missing = code != 0 and "pip install -e" in output
+        needs = re.search(r"needs the extra `(\w+)`", output)
+        missing = code == 2 and needs and needs[1] in ABSENT
         if not missing and (code != 0 or not last or (out is not None and not out.exists())):
             wrong.append(f"{text}: exit {code}: {last}")
         if "Traceback" in output:

@@ -24,6 +24,7 @@ from chebsplat.splats.gaussians import local_shape
 from chebsplat.splats.parts import cubes_of
 from chebsplat.stages.tools import camera_paths, up
 from chebsplat.stages.tools.mesh import turned
+from chebsplat.stages.tools.page import foreign
 from chebsplat.synthetic import layout, shuffled
 from chebsplat.synthetic.rays import RayCaster, intrinsics, walk
 from tests.stages.tools.test_page import held_in
@@ -251,3 +252,23 @@ def test_a_mesh_is_turned_so_that_up_is_what_its_format_has(suffix, wanted):
     np.testing.assert_allclose(found[1], wanted, atol=1e-6)
     np.testing.assert_allclose(found[1:] @ found[1:].T, np.eye(3), atol=1e-6)
     assert np.linalg.det(found[1:]) * np.linalg.det(corners[1:]) > 0  # turned, not mirrored
+
+
+@pytest.mark.parametrize("log_scales", [[[720, 720, 720]], [[100, 400, 400]] * 4])
+def test_huge_gaussians_are_shown_upright_with_the_rest(tmp_path, log_scales):
+    room = furnished(TURNS[1], np.random.default_rng(0))
+    room["log_scales"][: len(log_scales)] = log_scales
+    room["logit_opacities"][len(log_scales) :: 2] = -800
+    write_ply(tmp_path / "huge.ply", room, 0)
+    scene = foreign(tmp_path / "huge.ply")
+    assert -scene.cameras.cam_from_world[0, 1, :3] @ TURNS[1][:, 2] > 0.99
+    assert np.isfinite(camera_paths.draw_surface(scene.parameters)).all()
+
+
+def test_what_has_walls_and_nothing_in_it_is_not_called_no_room(caplog):
+    box = np.random.default_rng(0).uniform(0, 1, (3000, 3)) * [5, 4, 2.5]
+    rows, axes = np.arange(3000), np.arange(3000) % 3
+    ends = np.array([5, 4, 2.5])[axes] * (rows // 3 % 2)
+    box[rows, axes] = ends
+    up.up_of("auto", flat_gaussians(box, np.eye(3)[axes]))
+    assert "nothing in it tells up from down" in caplog.text
