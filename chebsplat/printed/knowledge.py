@@ -24,7 +24,7 @@ class Modulation(nn.Module):
     """alpha of the mean z of a region's tokens, by one layer.
 
     The layer's activation is open: a sigmoid. It learns with all else, as printed; the loss that it
-    weighs is the only one that reaches it, and pulls alpha to 0 (docs/method.md).
+    weighs is the only one that reaches it, and pulls alpha to 0.
     """
 
     def __init__(self, width: int):
