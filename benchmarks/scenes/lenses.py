@@ -2,8 +2,8 @@
 
 Six rooms that nothing was chosen on, each as two lenses show it: four generated, and the two of the
 modelled house where the test data is there (CHEBSPLAT_TEST_DATA). A folder is what `unposed` takes:
-images/, and truth.json with each photo's camera-to-world matrix in metres. Photos carry no EXIF;
-they have noise, and a principal point beside the middle.
+images/, and truth.json with each photo's camera-to-world matrix in metres. Photos carry no EXIF,
+and have noise.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ ROOMS = ("office", 31_001), ("room", 31_002), ("shuffled", 31_003), ("shuffled",
 HOUSE = "house_kitchen", "house_living"
 WIDTH, HEIGHT, FOV = 1152, 864, 84.0  # of a generated room; degrees across
 NOISE = 2.0  # standard deviation, of 255
-OFF_CENTRE = 0.004, -0.003  # of the principal point, in units of the photo's width
 
 
 class Lens(NamedTuple):
@@ -116,8 +115,8 @@ def generated(preset: str, seed: int, n_views: int) -> Iterator[tuple[np.ndarray
 def modelled(
     images: Path, frames: list[dict[str, Any]], n_views: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Views of the house, as `rooms` has them."""
-    for frame in frames[:: len(frames) // n_views]:
+    """Views of the house, as `rooms` has them; twice as many, since they are smaller."""
+    for frame in frames[:: max(len(frames) // (2 * n_views), 1)]:
         with Image.open(images / frame["file"]) as image:
             yield np.asarray(image.convert("RGB")), np.array(frame["c2w"])
 
@@ -126,13 +125,12 @@ def camera(K: np.ndarray, lens: Lens, width: int, height: int) -> np.ndarray:
     """K [3, 3] of the photo, as large as the pinhole's picture, of which it shows as much as leaves
     no corner empty.
     """
-    off = np.array(OFF_CENTRE) * width
     border = np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1) if (x, y) != (0, 0)])
     half = np.array([width, height]) / 2 * lens.part
     bent = np.abs(lens.bend(border * half / K[0, 0]))
     reach = np.array([bent[border[:, k] != 0, k].min() for k in (0, 1)])
-    focal = ((np.array([width, height]) / 2 + np.abs(off)) / reach).max()
-    return np.array([[focal, 0, width / 2 + off[0]], [0, focal, height / 2 + off[1]], [0, 0, 1.0]])
+    focal = (np.array([width, height]) / 2 / reach).max()
+    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
 
 
 def through(image: np.ndarray, K: np.ndarray, lens: Lens) -> np.ndarray:
