@@ -70,6 +70,9 @@ BENCHMARKS = {
         "scenes.unposed",
         "poses of photos that come alone, beside pycolmap's defaults; args=FOLDERS",
     ),
+    "lenses": Benchmark(
+        "scenes.lenses", "writes a dozen rendered captures with exact truth, for unposed"
+    ),
     "query": Benchmark(
         "scenes.query",
         "asking at the suggested cut: precision, recall, absent words; trains 5 rooms",

@@ -114,7 +114,9 @@ class PoseSection(Section):
     )
     camera: Literal[
         "auto", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "OPENCV", "OPENCV_FISHEYE", "EQUIRECTANGULAR"
-    ] = setting("auto", "model of the lens; auto: SIMPLE_RADIAL, or what the photos ask for")
+    ] = setting(
+        "auto", "model of the lens; auto: what the photos ask for, RADIAL if they are plain"
+    )
     peak_threshold: float = number(
         0.0067, "of SIFT; where few photos register, .002 is tried", 1e-6, 1
     )

@@ -54,7 +54,10 @@ def main(arguments: Sequence[str]) -> int:
                 ))  # fmt: skip
             except ChebsplatError as error:
                 print(
-                    f"| {folder.name} | {len(os.listdir(photos))} | {error} |{' |' * 8}", flush=True
+                    f"| {folder.name} | {len(os.listdir(photos))} | refused | {theirs['n']} | | "
+                    f"{theirs['points']} | | {theirs.get('error', np.nan):.2e} | "
+                    f"{time.perf_counter() - began:.0f} | {their_seconds:.0f} | |\n  {error}",
+                    flush=True,
                 )
                 continue
             seconds, facts = time.perf_counter() - began, model.judged

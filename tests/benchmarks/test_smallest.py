@@ -6,14 +6,17 @@ import importlib.util
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from PIL import Image
 from shared import ROOT, data
 
 import benchmarks.__main__ as bench
 from benchmarks import raster, shared
+from benchmarks.scenes import lenses
 from benchmarks.training import cost
 from chebsplat.stages.settings import TeachSection
+from chebsplat.synthetic.rays import intrinsics
 
 SETTINGS = (
     "teacher.kind=embedded,knowledge.start=shipped,train.steps=60,evaluate.timing_repeats=1,"
@@ -32,10 +35,11 @@ SMALLEST = {
     "teaching": "--rooms 1 --held-out 1 --seeds 0 --steps 3 --rooms-in {out}/rooms",
     "lessons": "--scenes {name} {name}",
     "unposed": "{photos}",
+    "lenses": "--views 1",
     "query": "--folders {work}",
     "stability": "--only pruning",
 }
-PRINT_ALONE = ("cost", "unposed")
+PRINT_ALONE = ("cost", "unposed", "lenses")
 BY_ITSELF = {"gpu"}  # test_what_awaits_a_gpu_runs_to_its_end_where_the_cpu_stands_in
 
 
@@ -103,6 +107,21 @@ def test_a_benchmark_runs_to_its_end_at_its_smallest_size(name, work, tmp_path, 
     code = bench.main([name, *arguments, "--out", str(tmp_path / "out")])
     assert code in (0, 1)  # by its bars, which are of whole scenes and quiet machines
     assert name in PRINT_ALONE or list((tmp_path / "out").glob("*.csv"))
+
+
+@pytest.mark.parametrize("name", lenses.LENSES)
+def test_a_lens_shows_each_point_where_its_equation_says(name):
+    lens, K = lenses.LENSES[name], intrinsics(120, 90, 84.0)
+    x, y = np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5)
+    photo = lenses.through(np.stack([x, y, 0 * x], -1), K, lens)
+    bent = lenses.camera(K, lens, 120, 90)
+    seen = lens.bend((photo[..., :2] - K[:2, 2]) / K[0, 0]) * bent[0, 0] + bent[:2, 2]
+    inside = (
+        slice(2, -2),
+        slice(2, -2),
+    )  # beyond the centres of the outermost pixels is no picture
+    assert np.abs(seen - np.stack([x, y], -1))[inside].max() < 0.02
+    assert np.abs(photo[..., 0] - x).max() > 3
 
 
 HELD = {"torch, 4 threads": 100.0, "cpu, 4 threads": 4.0, "cpu, 1 thread": 12.0,

@@ -221,8 +221,9 @@ def test_poses_and_the_lens_of_photos_are_found_and_what_it_bends_is_undone(tmp_
     code, model, config = posed(folder, tmp_path / "model")
     assert code == 0 and len(model.names) == 12
     name, params, width, height = model.cameras[0]
-    assert (name, width, height) == ("SIMPLE_RADIAL", 500, 920)
-    assert params[3] == pytest.approx(-0.15, abs=0.04)
+    assert (name, width, height) == ("RADIAL", 500, 920)
+    r2 = (250**2 + 460**2) / params[0] ** 2  # of a corner
+    assert params[3] * r2 + params[4] * r2**2 == pytest.approx(-0.15 * r2, abs=0.02)
     assert any("copies" in note for note in model.notes) and model.judged["doubts"] == []
     assert run_stage("ingest", tmp_path / "capture", {"model": tmp_path / "model"}, config) == 0
     capture = Capture.read(tmp_path / "capture")
