@@ -29,7 +29,7 @@ TURNED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.floa
 # quantisation that the format leaves to the writer; figures in docs/usage.md
 FINE = 3.0  # steps of a coordinate per thickness of the median Gaussian, at least
 ROTATION_STEP = 8  # of 511, in which an entry of a quaternion reaches 1/√2
-LIGHT_STEP = 4  # of 128, in which a coefficient reaches 1
+LIGHT_STEP = 2  # of 128, in which a coefficient reaches 1; `splats.rounded` has larger ones
 LEAST_STEPS = 4096  # of a coordinate across 90 % of a scene that is far from the origin
 MOST_CUT = 0.01  # share of Gaussians with a size that SPZ may lack
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.special import expit
 
-from chebsplat.cameras import upright
+from chebsplat.cameras import centers, upright
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.formats.names import suggest
 from chebsplat.formats.scene import Scene
@@ -23,6 +23,7 @@ from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import lacking, rows_of
 from chebsplat.render import SceneRenderer
 from chebsplat.splats.gaussians import surface_of
+from chebsplat.splats.rounded import rounded_light
 from chebsplat.splats.similarity import Similarity
 from chebsplat.stages.tools.query import Query, Relevancy, understood
 from chebsplat.stages.tools.up import up_of
@@ -249,12 +250,16 @@ class OpenedScene:
         if path.exists():
             raise ConfigError(f"{path} exists; remove it, or choose another path")
         parameters, world = self.parameters, self.world
+        eyes = centers(self.exported.cameras.cam_from_world)
         if up is None and path.suffix.lower() == ".glb":
             up = up_of("auto", parameters, self.exported.cameras.cam_from_world)
         if up is not None:
             turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ upright(up)
-            parameters = Similarity(1.0, turn, np.zeros(3)).of_gaussians(parameters)
+            turned = Similarity(1.0, turn, np.zeros(3))
+            parameters, eyes = turned.of_gaussians(parameters), turned.of_points(eyes)
             world = World(tuple((turn @ world.origin).tolist()), world.scale)
+        if path.suffix.lower() == ".spz":
+            parameters = rounded_light(parameters, eyes)
         write_splats(path, parameters, self.semantics(), world)
         return path
 
