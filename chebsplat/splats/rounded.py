@@ -30,7 +30,8 @@ def rounded_light(parameters: dict[str, np.ndarray], eyes: np.ndarray) -> dict[s
     step, eyes = (STEP, eyes) if known else (ALONE, eyes[:0])
     eyes = eyes[np.linspace(0, len(eyes) - 1, min(len(eyes), EYES)).astype(int)]
     light = np.concatenate([parameters["sh0"], parameters["shN"]], 1).astype(np.float64)
-    for rows in np.array_split(np.arange(len(light)), len(light) // BLOCK + 1):
+    lit = np.flatnonzero(light[:, 1:].any((1, 2)))
+    for rows in np.array_split(lit, len(lit) // BLOCK + 1):
         part = light[rows]
         lower = np.linalg.cholesky(_sides(parameters["means"][rows].astype(np.float64), eyes))
         taken = -np.diagonal(lower, axis1=1, axis2=2)[..., None] * np.linalg.inv(lower)
