@@ -49,9 +49,10 @@ class Scene:
     label_embeddings: np.ndarray | None = None
     summary: dict[str, Any] = field(default_factory=dict)
 
-    def write(self, out: Path) -> dict[str, int]:
+    def write(self, out: Path, rounded: dict[str, np.ndarray] | None = None) -> dict[str, int]:
         """Fill the directory that `artifact.publish` yields; returns bytes by part.
 
+        Args:    rounded: the parameters of `scene.spz`, where light is rounded for it.
         Raises:  ValueError on more than MOST_MEANINGS distinct features.
         Choices: `scene.ply` is trimmed to the highest degree in use, and `scene.spz` beside it
           if SPZ can represent the scene; both are in the source's world. Features are rows of a
@@ -66,7 +67,7 @@ class Scene:
         top = int(degrees.max(initial=0))
         write_ply(out / "scene.ply", p, top, self.labels, self.label_names, world)
         try:
-            write_spz(out / "scene.spz", p, top, world)
+            write_spz(out / "scene.spz", rounded or p, top, world)
         except DataFailure as error:
             self.summary["left_out"] = self.summary.get("left_out", {}) | {"scene.spz": str(error)}
         bands = {}

@@ -26,10 +26,11 @@ MOST_LIGHTS = 65_536  # rows of the palette, which two bytes count
 
 def write_sog(
     path: Path, parameters: dict[str, np.ndarray], degree: int, world: World = HERE
-) -> None:
+) -> np.ndarray:
     """Write raw parameters (`formats.gaussians.Gaussians.parameters`) as one .sog file.
 
     Args:   degree: highest band to write; world: of the parameters; the file has its source's.
+    Returns: the order of the file, i64 [N]: rows of the parameters.
     Choices: order and axes of `spz.write_spz`. The palette of light has the distinct rows of all
       Gaussians, in the finest steps from LIGHT_STEP on that give at most MOST_LIGHTS: pruned
       Gaussians share one row.
@@ -88,6 +89,7 @@ def write_sog(
     with zipfile.ZipFile(path, "w") as whole:
         for name, content in {"meta.json": json.dumps(meta).encode(), **files}.items():
             whole.writestr(zipfile.ZipInfo(name), content)
+    return order
 
 
 def lights(shN: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Splats of other programs: PLY, SPZ, SOG, GLB (written), .splat and 3DGS' folder (read)."""
+"""Splats as viewers have them: PLY, SPZ, SOG, GLB; .splat and 3DGS' folder are read alone."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.files import atomic_path, regular
-from chebsplat.formats.gltf import write_splat_glb
+from chebsplat.formats.gltf import read_meanings, read_splat_glb, write_splat_glb
 from chebsplat.formats.packed import C0, raw_parameters
 from chebsplat.formats.ply import drop_unusable, read_ply, write_ply
+from chebsplat.formats.semantics import Semantics, read_beside
 from chebsplat.formats.sog import read_sog, write_sog
 from chebsplat.formats.spz import LARGEST, REMEDY, read_spz, write_spz
 from chebsplat.formats.world import HERE, World
 
-READ = (".ply", ".spz", ".sog", ".splat")
+READ = (".ply", ".spz", ".sog", ".glb", ".splat")
 OTHERS = (".ksplat", ".sogs", ".lcc", ".rad")
 WRITTEN = (".ply", ".spz", ".sog", ".glb")
 
@@ -63,7 +64,7 @@ def read_splats(
     Raises: InputError naming the file.
     """
     path = splat_file(Path(path))
-    readers = {".spz": read_spz, ".sog": read_sog, ".splat": _splat}
+    readers = {".spz": read_spz, ".sog": read_sog, ".glb": read_splat_glb, ".splat": _splat}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         return read_ply(path, world)
@@ -82,29 +83,45 @@ def read_splats(
     )
 
 
+def read_semantics(path: Path) -> Semantics | None:
+    """What the Gaussians of a splat mean, in its order: told by a GLB itself, or beside the file.
+
+    None where nothing is told. Raises: InputError naming the file.
+    """
+    path = splat_file(Path(path))
+    return (read_meanings if path.suffix.lower() == ".glb" else read_beside)(path)
+
+
 def write_splats(
     path: Path,
     parameters: dict[str, np.ndarray],
-    labels: np.ndarray | None = None,
-    label_names: list[str] | None = None,
+    semantics: Semantics | None = None,
     world: World = HERE,
 ) -> None:
     """Write raw parameters with their `degrees` in the format that the file's name ends with, in
-    the place of what is there; args as of `ply.write_ply`.
+    the place of what is there, with what they mean; world: of the parameters, the file has its
+    source's.
 
     Raises:  ConfigError on another ending than WRITTEN; DataFailure as `spz.write_spz`.
-    Choices: bands above the highest degree in use are left out. PLY and GLB hold labels.
+    Choices: bands above the highest degree in use are left out. PLY holds labels, GLB features as
+      well, SPZ and SOG have both beside them (`formats.semantics`).
     """
     suffix, degree = path.suffix.lower(), int(parameters["degrees"].max())
     if suffix not in WRITTEN or path.name.endswith(".compressed.ply"):
         raise ConfigError(f"{path}: a splat is written as {', '.join(WRITTEN)}; name it so")
+    order = None
     with atomic_path(path) as temporary:
         if suffix in (".spz", ".sog"):
             write = write_spz if suffix == ".spz" else write_sog
-            write(temporary, parameters, degree, world)
+            order = write(temporary, parameters, degree, world)
+        elif suffix == ".glb":
+            write_splat_glb(temporary, parameters, degree, semantics, world)
         else:
-            write_labelled = write_ply if suffix == ".ply" else write_splat_glb
-            write_labelled(temporary, parameters, degree, labels, label_names, world)
+            labels = None if semantics is None else semantics.labels[semantics.meanings]
+            names = None if semantics is None else semantics.names
+            write_ply(temporary, parameters, degree, labels, names, world)
+    if semantics is not None and order is not None:
+        semantics.write(path, order)
 
 
 def _splat(path: Path) -> tuple[dict[str, np.ndarray], int]:

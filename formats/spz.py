@@ -29,17 +29,18 @@ TURNED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.floa
 # quantisation that the format leaves to the writer; figures in docs/usage.md
 FINE = 3.0  # steps of a coordinate per thickness of the median Gaussian, at least
 ROTATION_STEP = 8  # of 511, in which an entry of a quaternion reaches 1/√2
-LIGHT_STEP = 4  # of 128, in which a coefficient reaches 1
+LIGHT_STEP = 2  # of 128, in which a coefficient reaches 1; `splats.rounded` has larger ones
 LEAST_STEPS = 4096  # of a coordinate across 90 % of a scene that is far from the origin
 MOST_CUT = 0.01  # share of Gaussians with a size that SPZ may lack
 
 
 def write_spz(
     path: Path, parameters: dict[str, np.ndarray], degree: int, world: World = HERE
-) -> None:
+) -> np.ndarray:
     """Write raw parameters (`formats.gaussians.Gaussians.parameters`) as SPZ of version 3.
 
     Args:   degree: highest band to write; world: of the parameters; the file has its source's.
+    Returns: the order of the file, i64 [N]: rows of the parameters.
     Raises: DataFailure where centres or sizes do not fit into 24 and 8 bits.
     Choices: Gaussians are in the order of a curve, so that neighbours in the file are neighbours in
       space. Of the 24 equivalent orders and signs of a Gaussian's axes, the one with the smallest
@@ -68,6 +69,7 @@ def write_spz(
     content = HEADER.pack(b"NGSP", 3, len(means), degree, bits, 0)
     content += b"".join(np.rint(plane).clip(0, 255).astype(np.uint8).tobytes() for plane in planes)
     path.write_bytes(gzip.compress(content, 9, mtime=0))
+    return order
 
 
 def _fraction_bits(means: np.ndarray, log_scales: np.ndarray) -> int:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from chebsplat.cameras import centers
 from chebsplat.errors import DataFailure, InputError
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
@@ -14,6 +15,7 @@ from chebsplat.formats.scene import Scene
 from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.dictionary import shared_features
+from chebsplat.splats.rounded import rounded_light
 from chebsplat.stages.runtime.command import Job
 
 
@@ -68,7 +70,8 @@ def run(job: Job) -> None:
     }
     summary |= World.read(gaussians.notes).notes
     scene = Scene(parameters, gaussians.cameras, order, **labelled, summary=summary)
-    sizes = scene.write(job.out)
+    eyes = centers(gaussians.cameras.cam_from_world)
+    sizes = scene.write(job.out, rounded_light(parameters, eyes))
     job.facts |= {"n_gaussians": len(order), "by_degree": counts, "bytes": sizes}
 
 

@@ -57,10 +57,12 @@ def mixed(toy, tmp_path_factory):
     """The toy checkpoint with every SH degree in use, and its scene."""
     import numpy as np
 
+    from chebsplat.cameras import centers
     from chebsplat.formats import artifact
     from chebsplat.formats.gaussians import Gaussians
     from chebsplat.formats.manifest import Manifest
     from chebsplat.formats.scene import Scene
+    from chebsplat.splats.rounded import rounded_light
 
     checkpoint = Gaussians.read(toy["train"])
     p = checkpoint.parameters
@@ -77,7 +79,8 @@ def mixed(toy, tmp_path_factory):
     before.labels, before.order = before.labels[back][order], order
     path = tmp_path_factory.mktemp("mixed") / "scene"
     with artifact.publish(path, Manifest(Scene.SCHEMA, KEY, "test")) as tmp:
-        before.write(tmp)
+        eyes = centers(before.cameras.cam_from_world)
+        before.write(tmp, rounded_light(before.parameters, eyes))
     return checkpoint, path
 
 

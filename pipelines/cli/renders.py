@@ -187,10 +187,11 @@ def _write_page(
     from chebsplat.formats.scene import Scene
     from chebsplat.formats.teacher_model import read_label_set
     from chebsplat.pipelines.work.finished import artifact_of, teacher_of
-    from chebsplat.stages.tools.page import foreign, write_page
+    from chebsplat.stages.tools.page import foreign, with_own_semantics, write_page
 
     if is_splat(scene):
-        opened, teacher, up = foreign(Path(scene).expanduser(), up), None, None
+        splat = Path(scene).expanduser()
+        opened, teacher, up = with_own_semantics(foreign(splat, up), splat), None, None
     else:
         opened, teacher = Scene.read(artifact_of(scene, "export")), teacher_of(scene)
     more = list(read_label_set(words)) if words else []

@@ -155,8 +155,8 @@ def export(scene: str, kind: str, out: Path | None, up: Any) -> None:
 @UP
 @click.option("--out", type=NewPath(), required=True, help="the folder to make")
 def lift(ply: Path, capture: str | None, teacher: Path | None, up: Any, out: Path) -> None:
-    """Make a scene of any splat (.PLY, .spz, .splat, a folder of 3DGS): to render, page and extract
-    from; with --capture, in whose frame it lies, to query, too.
+    """Make a scene of any splat (.PLY, .spz, .sog, .glb, .splat, a folder of 3DGS): to render, page
+    and extract from; with --capture, in whose frame it lies, to query, too.
 
     Without a .PLY, the stage of this name: --help says more.
     """

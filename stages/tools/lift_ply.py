@@ -24,7 +24,7 @@ from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.names import suggest
 from chebsplat.formats.ply import write_ply
 from chebsplat.formats.points import Points
-from chebsplat.formats.splats import read_splats, splat_file
+from chebsplat.formats.splats import read_semantics, read_splats, splat_file
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.formats.world import HERE, World
 from chebsplat.labels.decode import decode
@@ -105,6 +105,8 @@ def import_ply(ply: Path, out: Path, up: Up | None = None) -> dict[str, Any]:
     Returns: counts. Raises: InputError on what cannot be read.
     """
     scene = foreign(ply, up)
+    if read_semantics(ply) is not None:
+        log.warning("what %s says of its Gaussians is left out; page and view show it", ply)
     write_gaussians(ply, scene.parameters, scene.cameras, out, World.read(scene.summary))
     publish("export", export.run, out / "export", {"gaussians": out / "gaussians"})
     return {"gaussians": artifact.read_manifest(out / "export").facts["n_gaussians"]}

@@ -7,19 +7,19 @@ import gzip
 import logging
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from chebsplat.errors import ConfigError
+from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.calibration import calibration_of
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.files import atomic_path
 from chebsplat.formats.packed import pack, signed, to_bytes
 from chebsplat.formats.scene import Scene
-from chebsplat.formats.splats import read_splats
+from chebsplat.formats.splats import read_semantics, read_splats
 from chebsplat.formats.teacher_model import EMBEDDED, read_label_set, read_label_table, read_teacher
 from chebsplat.formats.world import HERE, World
 from chebsplat.labels.calibration import Calibration
@@ -180,6 +180,29 @@ def foreign(ply: Path, up: Up | None = None, world: World | None = None) -> Scen
     K = np.array([[554.0, 0, 320], [0, 554, 240], [0, 0, 1]])  # 60 degrees across
     return Scene(
         parameters, Cameras(["start"], K[None], pose[None], 640, 480), order, summary=target.notes
+    )
+
+
+def with_own_semantics(scene: Scene, splat: Path) -> Scene:
+    """The scene of a splat from elsewhere (`foreign`), with what is told of it in or beside it.
+
+    Raises: InputError where that is of another number of Gaussians.
+    """
+    told = read_semantics(splat)
+    if told is None:
+        return scene
+    if len(told.meanings) != len(scene.order):
+        raise InputError(
+            f"{splat} has {len(scene.order)} Gaussians that can be shown and tells the meanings of "
+            f"{len(told.meanings)}; export the scene again"
+        )
+    rows = told.meanings[scene.order]
+    return replace(
+        scene,
+        parameters=scene.parameters | {"features": told.features[rows]},
+        labels=told.labels[rows].astype(np.int32),
+        label_names=told.names,
+        label_embeddings=told.embeddings,
     )
 
 

@@ -12,16 +12,18 @@ import numpy as np
 import torch
 from scipy.special import expit
 
-from chebsplat.cameras import upright
+from chebsplat.cameras import centers, upright
 from chebsplat.errors import ConfigError, DataFailure
 from chebsplat.formats.names import suggest
 from chebsplat.formats.scene import Scene
+from chebsplat.formats.semantics import Semantics
 from chebsplat.formats.splats import write_splats
 from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import lacking, rows_of
 from chebsplat.render import SceneRenderer
 from chebsplat.splats.gaussians import surface_of
+from chebsplat.splats.rounded import rounded_light
 from chebsplat.splats.similarity import Similarity
 from chebsplat.stages.tools.query import Query, Relevancy, understood
 from chebsplat.stages.tools.up import up_of
@@ -224,13 +226,21 @@ class OpenedScene:
         )
         return OpenedScene(part, self.source, self._teacher)
 
+    def semantics(self) -> Semantics | None:
+        """What the Gaussians mean, as a table that travels with a file; None without semantics."""
+        if self.labels is None or self.label_names is None or self.label_embeddings is None:
+            return None
+        features = self.parameters["features"]
+        return Semantics.of(features, self.labels, self.label_names, self.label_embeddings)
+
     def points(self) -> tuple[np.ndarray, np.ndarray]:
         """Centres [N, 3], f32 (f64 in another world), and colours u8 [N, 3] of SH degree 0."""
         means = self.world.outward(self.parameters["means"])
         return means, np.round(surface_of(self.parameters)[1] * 255).astype(np.uint8)
 
     def export(self, path: str | Path, up: np.ndarray | None = None) -> Path:
-        """Write a splat as .ply, .spz, .sog or .glb, by the name's ending; PLY and GLB have labels.
+        """Write a splat as .ply, .spz, .sog or .glb, by the name's ending, with what it means where
+        that is known: PLY has labels, GLB features, too, SPZ and SOG both in a file beside them.
 
         Args:    up: against gravity, unit [3]: the splat is turned so that up is -y, as in viewers,
           or y of a .glb; None: it stays in the capture's frame, a .glb upright by the cameras.
@@ -239,15 +249,18 @@ class OpenedScene:
         path = Path(path)
         if path.exists():
             raise ConfigError(f"{path} exists; remove it, or choose another path")
-        parameters, world, glb = self.parameters, self.world, path.suffix.lower() == ".glb"
-        if up is None and glb:
+        parameters, world = self.parameters, self.world
+        eyes = centers(self.exported.cameras.cam_from_world)
+        if up is None and path.suffix.lower() == ".glb":
             up = up_of("auto", parameters, self.exported.cameras.cam_from_world)
         if up is not None:
-            turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright(up)
-            turn = turn if glb else np.diag([1.0, -1, -1]) @ turn
-            parameters = Similarity(1.0, turn, np.zeros(3)).of_gaussians(parameters)
+            turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]) @ upright(up)
+            turned = Similarity(1.0, turn, np.zeros(3))
+            parameters, eyes = turned.of_gaussians(parameters), turned.of_points(eyes)
             world = World(tuple((turn @ world.origin).tolist()), world.scale)
-        write_splats(path, parameters, self.labels, self.label_names, world)
+        if path.suffix.lower() == ".spz":
+            parameters = rounded_light(parameters, eyes)
+        write_splats(path, parameters, self.semantics(), world)
         return path
 
 

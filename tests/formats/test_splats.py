@@ -21,7 +21,15 @@ from shared import gaussian_parameters
 import chebsplat.kernels.jit  # noqa: F401  # chooses the threading layer before gsply's numba
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats import ply
-from chebsplat.formats.splats import READ, is_splat, read_splats, write_splats
+from chebsplat.formats.semantics import Semantics
+from chebsplat.formats.splats import (
+    READ,
+    WRITTEN,
+    is_splat,
+    read_semantics,
+    read_splats,
+    write_splats,
+)
 from chebsplat.formats.world import World
 from chebsplat.splats.sh import basis
 
@@ -94,9 +102,10 @@ def covariances(p):
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize(
-    ("suffix", "centre", "light"), [(".spz", 1 / 8, 1 / 64), (".sog", 3e-4, 1 / 80)]
+    ("suffix", "centre", "light"),
+    [(".spz", 1 / 8, 1 / 64), (".sog", 3e-4, 1 / 80), (".glb", 1e-5, 0)],
 )
-def test_what_is_written_small_is_the_same_splat(tmp_path, suffix, centre, light, degree):
+def test_what_is_written_is_the_same_splat(tmp_path, suffix, centre, light, degree):
     """In another order, by other axes of the same ellipsoids, in the source's own world."""
     p = given(degree) | {"degrees": np.full(N, degree, np.uint8)}
     p["quats"][0] = 0  # as renderers have it: no turn
@@ -180,34 +189,184 @@ def test_spz_of_version_4_is_streams_of_zstd(tmp_path, degree):
     assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
 
 
-def test_glb_holds_what_gltf_asks_for_of_gaussians(tmp_path):
-    p = given(1) | {"degrees": np.ones(N, np.uint8)}
-    labels, world = np.arange(N) - 1, World((1.0, 2.0, 3.0), 2.0)
-    write_splats(tmp_path / "a.glb", p, labels, ["wall"], world)
-    raw = (tmp_path / "a.glb").read_bytes()
+def meaning():
+    """Three labels and none, a number of features that many of the Gaussians share."""
+    rng = np.random.default_rng(4)
+    features, rows = rng.normal(size=(9, 4)).astype(np.float16), rng.integers(0, 9, N)
+    labels = np.arange(9)[rows] % 4 - 1
+    words = rng.normal(size=(3, 4)).astype(np.float32)
+    return Semantics.of(features[rows], labels, ["wall", "café", "sofa"], words)
+
+
+def parts_of(path):
+    """The document of a GLB and the bytes after it."""
+    raw = path.read_bytes()
     length, size = struct.unpack("<II", raw[8:16])
-    document, binary = json.loads(raw[20 : 20 + size]), raw[28 + size :]
-    assert length == len(raw) and document["extensionsUsed"] == ["KHR_gaussian_splatting"]
-    mesh = document["meshes"][0]
+    assert length == len(raw)
+    return json.loads(raw[20 : 20 + size]), raw[28 + size :]
+
+
+def glb_of(path, document, binary):
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(binary))
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    path.write_bytes(head + chunks + struct.pack("<I4s", len(binary), b"BIN\0") + binary)
+    return path
+
+
+def test_glb_holds_what_gltf_asks_for_of_gaussians(tmp_path):
+    """Of its extensions in the axes of glTF, half a turn about x from those of a PLY."""
+    p = given(1) | {"degrees": np.ones(N, np.uint8)}
+    told, world = meaning(), World((1.0, 2.0, 3.0), 2.0)
+    write_splats(tmp_path / "a.glb", p, told, world)
+    document, binary = parts_of(tmp_path / "a.glb")
+    mesh, used = document["meshes"][0], set(document["extensionsUsed"])
+    assert used == {"KHR_gaussian_splatting", "EXT_mesh_features", "EXT_structural_metadata"}
+    assert used == {*mesh["primitives"][0]["extensions"], *document["extensions"]}
     held = {}
     for name, k in mesh["primitives"][0]["attributes"].items():
         view, kind = document["bufferViews"][k], document["accessors"][k]["componentType"]
         part = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
         held[name] = np.frombuffer(part, {5126: "<f4", 5123: "<u2"}[kind]).reshape(N, -1)
     own = {name.removeprefix("KHR_gaussian_splatting:"): v for name, v in held.items()}
-    np.testing.assert_allclose(own["POSITION"], world.outward(p["means"]), rtol=1e-6)
+    half = [1, -1, -1]
+    np.testing.assert_allclose(own["POSITION"], world.outward(p["means"]) * half, rtol=1e-6)
     np.testing.assert_allclose(own["SCALE"], 2 * np.exp(p["log_scales"]), rtol=1e-5)
-    np.testing.assert_allclose(own["ROTATION"], p["quats"][:, [1, 2, 3, 0]], atol=1e-6)
+    quats = p["quats"] * [1, 1, -1, -1]
+    np.testing.assert_allclose(own["ROTATION"], quats[:, [1, 2, 3, 0]], atol=1e-6)
     np.testing.assert_allclose(own["OPACITY"][:, 0], expit(p["logit_opacities"]), atol=1e-6)
-    for k in range(3):
-        assert np.array_equal(own[f"SH_DEGREE_1_COEF_{k}"], p["shN"][:, k])
+    for k, sign in enumerate([-1, -1, 1]):  # of y, z, x
+        assert np.array_equal(own[f"SH_DEGREE_1_COEF_{k}"], sign * p["shN"][:, k])
     assert not any("DEGREE_2" in name for name in own)
-    assert np.array_equal(own["_LABEL"][:, 0], labels) and mesh["extras"]["label_names"] == ["wall"]
+    assert np.array_equal(own["_FEATURE_ID_0"][:, 0], told.meanings)
+    metadata = document["extensions"]["EXT_structural_metadata"]
+    names = {row["value"]: row["name"] for row in metadata["schema"]["enums"]["label"]["values"]}
+    assert names == {-1: "(none)", 0: "wall", 1: "café", 2: "sofa"}
+    table = metadata["propertyTables"][0]["properties"]["label"]["values"]
+    view = document["bufferViews"][table]
+    assert view["byteOffset"] % 4 == 0
+    assert np.array_equal(np.frombuffer(binary, "<i4", 9, view["byteOffset"]), told.labels)
     white = (p["sh0"][:, 0] * 0.28209479 + 0.5).clip(0, 1)
     shown = own["COLOR_0"] / 65535
     display = np.where(shown > 0.0031308, 1.055 * shown ** (1 / 2.4) - 0.055, 12.92 * shown)
     np.testing.assert_allclose(display[:, :3], white, atol=1e-3)
     assert np.abs(shown[:, 3] - own["OPACITY"][:, 0]).max() < 1e-4
+
+
+@pytest.mark.parametrize("suffix", WRITTEN)
+def test_what_gaussians_mean_travels_with_them(tmp_path, suffix):
+    """In the order of the file; PLY has labels of its own, and nothing that words can ask."""
+    path, p, told = tmp_path / f"a{suffix}", given() | {"degrees": np.full(N, 3)}, meaning()
+    write_splats(path, p)
+    assert read_semantics(path) is None
+    write_splats(path, p, told)
+    found, _, labels = read_splats(path)
+    order = cKDTree(p["means"]).query(found["means"])[1]
+    assert sorted(order) == list(range(N))
+    wanted, known = told.labels[told.meanings][order], read_semantics(path)
+    if suffix == ".ply":
+        assert known is None and np.array_equal(labels, wanted)
+        return
+    assert np.array_equal(known.labels[known.meanings], wanted)
+    assert np.array_equal(known.features[known.meanings], told.features[told.meanings][order])
+    assert known.names == told.names and np.array_equal(known.embeddings, told.embeddings)
+
+
+@pytest.mark.parametrize(
+    ("changed", "word"),
+    [
+        ({"splat": np.array("0" * 64)}, "not of the a.spz beside it"),
+        ({"labels": np.full(9, 3)}, "labels holds more than -1 to 2"),
+        ({"meanings": np.full(N, -1)}, "meanings holds more than 0 to 8"),
+        ({"features": np.full((9, 4), np.nan)}, "not finite"),
+        ({"features": np.zeros((9, 3))}, "of different sizes"),
+        ({"embeddings": np.array(["a"])}, "could not convert"),
+        ({"names": None}, "'names'"),
+    ],
+)
+def test_meanings_that_do_not_fit_are_refused(tmp_path, changed, word):
+    path = tmp_path / "a.spz"
+    write_splats(path, given() | {"degrees": np.full(N, 3)}, meaning())
+    told = tmp_path / "a.spz.labels.npz"
+    with np.load(told) as stored:
+        arrays = {name: value for name, value in {**stored, **changed}.items() if value is not None}
+    np.savez(told, **arrays)
+    with pytest.raises(InputError, match=rf"labels\.npz does not fit .*{word}.*; remove it"):
+        read_semantics(path)
+
+
+def splats_of(document):
+    return document["meshes"][0]["primitives"][0]
+
+
+def without(document, name):
+    del splats_of(document)["attributes"][f"KHR_gaussian_splatting:{name}"]
+
+
+def accessor(document, name, **changes):
+    k = splats_of(document)["attributes"][name]
+    document["accessors"][k] |= changes
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda d: splats_of(d)["extensions"].clear(), "0 primitives of Gaussians"),
+        (lambda d: d["meshes"].append(d["meshes"][0]), "2 primitives of Gaussians"),
+        (lambda d: d.clear(), "0 primitives of Gaussians"),
+        (lambda d: without(d, "SCALE"), "no KHR_gaussian_splatting:SCALE"),
+        (lambda d: without(d, "SH_DEGREE_1_COEF_2"), "no KHR_gaussian_splatting:SH_DEGREE_1"),
+        (lambda d: accessor(d, "POSITION", componentType=5122), "POSITION is VEC3 of 5122"),
+        (lambda d: accessor(d, "POSITION", type="VEC4"), "POSITION is VEC4"),
+        (lambda d: accessor(d, "POSITION", count=N - 1), "of different lengths"),
+        (lambda d: accessor(d, "POSITION", count=10**9), "size of buffer"),
+        (lambda d: accessor(d, "POSITION", count="9"), "no GLB of Gaussians"),
+        (lambda d: accessor(d, "POSITION", bufferView=99), "no GLB of Gaussians"),
+        (lambda d: d["bufferViews"][3].update(byteOffset=0), "below 0"),
+        (lambda d: d["nodes"][0].update(scale=[2, 2, 2]), "a node of it is moved"),
+        (
+            lambda d: splats_of(d)["extensions"]["KHR_gaussian_splatting"].update(
+                colorSpace="lin_rec709_display"
+            ),
+            "colours lin_rec709_display",
+        ),
+        (
+            lambda d: splats_of(d)["extensions"]["KHR_gaussian_splatting"].update(
+                extensions={"KHR_gaussian_splatting_compression_spz_2": {}}
+            ),
+            "packed by KHR_gaussian_splatting_compression_spz_2",
+        ),
+        (lambda d: d.update(meshes=[[]]), "no GLB of Gaussians"),
+    ],
+)
+def test_a_glb_without_gaussians_that_are_read_says_so(tmp_path, change, word):
+    write_splats(tmp_path / "a.glb", given(1) | {"degrees": np.ones(N, np.uint8)})
+    document, binary = parts_of(tmp_path / "a.glb")
+    change(document)
+    with pytest.raises(InputError, match=rf"b\.glb .*{word}.*, or export it as PLY"):
+        read_splats(glb_of(tmp_path / "b.glb", document, binary))
+
+
+def test_a_glb_of_normalised_integers_between_others_reads(tmp_path):
+    """Opacities and rotations as other writers quantise them, interleaved."""
+    p = given(0) | {"degrees": np.zeros(N, np.uint8)}
+    write_splats(tmp_path / "a.glb", p)
+    document, binary = parts_of(tmp_path / "a.glb")
+    rows = np.zeros(N, [("quats", "i1", 4), ("opacity", "<u2"), ("gap", "u1", 2)])
+    quats = p["quats"][:, [1, 2, 3, 0]] * [1, -1, -1, 1]
+    rows["quats"] = np.round(127 * quats)
+    rows["opacity"] = np.round(65535 * expit(p["logit_opacities"]))
+    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": rows.nbytes, "byteStride": 8}
+    views = len(document["bufferViews"])
+    document["bufferViews"].append(view)
+    name = "KHR_gaussian_splatting"
+    accessor(document, f"{name}:ROTATION", bufferView=views, componentType=5120, normalized=True)
+    changes = {"bufferView": views, "componentType": 5123, "normalized": True, "byteOffset": 4}
+    accessor(document, f"{name}:OPACITY", **changes)
+    found = read_splats(glb_of(tmp_path / "b.glb", document, binary + rows.tobytes()))[0]
+    alike(found["quats"], p["quats"], 0.02)
+    np.testing.assert_allclose(found["logit_opacities"], p["logit_opacities"], atol=1e-3)
 
 
 def test_spz_of_version_2_holds_quaternions_of_three_bytes(tmp_path):
@@ -255,6 +414,8 @@ def spz(version, n, degree):
 @pytest.mark.parametrize(("name", "content", "word"), [
     ("a.ksplat", b"any", "export it as PLY, for example with SuperSplat"),
     ("a.SOG", b"any", "is cut or no SOG of version 2"),
+    ("a.glb", b"any", "is no GLB of Gaussians that is read"),
+    ("a.glb", struct.pack("<4sIII4s", b"glTF", 1, 99, 9, b"JSON"), "no header of glTF 2"),
     ("a.splat", bytes(33), "no multiple of 32"),
     ("a.spz", b"any", "is cut or no SPZ"),
     ("a.spz", spz(4, 1, 0) + bytes(16), "is cut or no SPZ of version 2 to 4"),
@@ -332,6 +493,12 @@ def emptied(path):
         path.write_bytes(gzip.compress(spz(3, 0, 1)[:16]))
     elif path.suffix == ".splat":
         path.write_bytes(b"")
+    elif path.suffix == ".glb":
+        write_splats(path, given(0) | {"degrees": np.zeros(N, np.uint8)})
+        document, binary = parts_of(path)
+        for part in document["accessors"]:
+            part["count"] = 0
+        glb_of(path, document, binary)
     else:
         write_splats(path, given(0) | {"degrees": np.zeros(N, np.uint8)})
         with zipfile.ZipFile(path) as whole:

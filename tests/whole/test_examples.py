@@ -1,4 +1,4 @@
-"""The examples run as they stand: both scripts, and the notebook cell by cell, without Jupyter."""
+"""The examples run as they stand: the scripts, and the notebook cell by cell, without Jupyter."""
 
 import json
 import os
@@ -6,6 +6,7 @@ import runpy
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from shared import ROOT
 
@@ -25,6 +26,20 @@ def test_asking_and_taking_writes_what_is_selected(toy, tmp_path, capsys):
     parameters, _, _ = read_ply(tmp_path / "part.ply")
     assert len(parameters["means"]) == scene.ask(word).selected.sum() > 0
     assert "Gaussians" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["spz", "sog", "glb"])
+def test_classes_of_an_exported_file_are_counted_without_us(toy, tmp_path, kind):
+    import chebsplat
+
+    scene = chebsplat.load(toy["export"])
+    out = scene.export(tmp_path / f"toy.{kind}")
+    command = [sys.executable, EXAMPLES / "count_labels.py", out]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True, cwd=tmp_path)
+    found = [line.rsplit(maxsplit=1) for line in shown.stdout.splitlines()]
+    counts = np.bincount(scene.labels + 1, minlength=len(scene.label_names) + 1)
+    assert found == [[n, str(c)] for n, c in zip(["none", *scene.label_names], counts, strict=True)]
+    assert (counts > 0).sum() > 2
 
 
 def test_the_notebook_runs_cell_by_cell(toy, monkeypatch, capsys):

@@ -17,6 +17,7 @@ from shared import INPUTS, TOY, data, run_stage
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.packed import Packed, unpack
 from chebsplat.formats.ply import read_ply, write_ply
+from chebsplat.formats.splats import write_splats
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.render import SceneRenderer
@@ -129,11 +130,13 @@ def test_training_goes_on_from_a_splat_that_others_made(toy, tmp_path):
     assert run_stage("train", tmp_path / "no", inputs, config) == 3
 
 
-@pytest.mark.parametrize("name", ["a.splat", "theirs"])
+@pytest.mark.parametrize("name", ["a.splat", "a.glb", "theirs"])
 def test_a_splat_file_and_a_folder_of_3dgs_become_a_scene_and_a_page(tmp_path, name):
     """Whose name says nothing of a PLY."""
     path = tmp_path / name
-    if path.suffix:
+    if path.suffix == ".glb":
+        write_splats(path, room(9)[0])
+    elif path.suffix:
         row = np.array([(0, 0, 1, 0.1, 0.1, 0.1)], "<f4").tobytes() + bytes(
             [9, 99, 200, 255, 255, 128, 128, 128]
         )

@@ -19,7 +19,7 @@ def test_gaussians_share_few_features_and_keep_their_labels(length):
     words = np.linalg.qr(np.random.default_rng(1).normal(size=(16, 16)))[0][:8]
     features, labels = around(words, 5000, 0.05)
     features[::50] = 0
-    shared = shared_features(features * np.float32(length), 40)
+    shared = shared_features(features * np.float32(length), (40,))
     assert len(np.unique(shared[features.any(1)], axis=0)) <= 40
     assert not shared[::50].any()
     known = features.any(1)
@@ -30,4 +30,13 @@ def test_gaussians_share_few_features_and_keep_their_labels(length):
 
 def test_few_features_stay_as_they_are():
     features = around(np.eye(8), 40, 0.05)[0]
-    assert np.array_equal(shared_features(features, 40), features)
+    assert np.array_equal(shared_features(features, (40, 80)), features)
+
+
+@pytest.mark.parametrize(("spread", "rows"), [(0.01, 8), (0.07, 32), (0.5, 64)])
+def test_features_that_differ_more_get_more_rows(spread, rows):
+    """Around eight words of length 1, by a spread a channel: 6 % of error are asked for."""
+    features = np.concatenate([np.eye(8)] * 300).astype(np.float32)
+    features[:, :2] += spread * np.random.default_rng(0).normal(size=(len(features), 2))
+    shared = shared_features(features, (8, 16, 32, 64))
+    assert len(np.unique(shared, axis=0)) == rows

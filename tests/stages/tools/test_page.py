@@ -211,6 +211,26 @@ def test_a_page_of_a_foreign_ply_has_no_semantic_controls(tmp_path):
     assert not re.search(r'id="(ask|legend|words)"', out.read_text())
 
 
+@pytest.mark.parametrize("kind", ["spz", "sog", "glb"])
+def test_a_page_of_an_exported_file_knows_its_labels(scene, tmp_path, kind, caplog):
+    """By what travels with the file: nothing is computed, and no teacher is near."""
+    splat = load(scene[0]).export(tmp_path / f"room.{kind}")
+    about, arrays = held_in(page_of(splat, tmp_path / "room.html"))
+    assert [label["name"] for label in about["labels"]] == LABELS == about["words"]
+    labels = arrays["labels"].astype(int) - 1
+    assert np.array_equal(np.bincount(labels + 1), np.bincount(scene[1].labels + 1))
+    shared = arrays["features"].T[arrays["meanings"]] * about["ranges"]["features"]["step"]
+    decoded = decode_labels(shared, arrays["label_embeddings"])
+    assert (decoded == labels)[labels >= 0].mean() > 0.95  # each byte of a channel is rounded
+    lifted = CliRunner().invoke(main, ["lift", str(splat), "--out", str(tmp_path / "made")])
+    assert lifted.exit_code == 0
+    assert f"what {splat} says of its Gaussians is left out" in lifted.output + caplog.text
+    told = tmp_path / f"room.{kind}.labels.npz"
+    if told.exists():
+        told.rename(tmp_path / "elsewhere")
+        assert "labels" not in held_in(page_of(splat, tmp_path / "plain.html"))[0]
+
+
 def test_names_are_text_of_a_page_and_never_markup(scene, tmp_path):
     held = replace(scene[1], labels=np.arange(N, dtype=np.int32) % 15, label_names=NAMES)
     held.label_embeddings = np.tile(words()[:5], (3, 1))
