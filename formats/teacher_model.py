@@ -116,7 +116,7 @@ def read_teacher(path: Path) -> TeacherModel:
             f"{settings} is missing; write it beside the model, with at least mean, std and "
             "labels (docs/teachers.md)"
         )
-    values = {
+    values: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value
         for key, value in read_settings(settings).items()
     }
