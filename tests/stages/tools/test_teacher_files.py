@@ -1,15 +1,12 @@
 """Teachers by the address of their ONNX file: a path, a file: URL, and a server of our own."""
 
 import os
-import threading
-from contextlib import contextmanager
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import onnx
 import pytest
 from onnx import helper
+from served import Quiet, served
 from tiny_teachers import COLORS, color_teacher, moved_out, write_model
 
 from chebsplat.errors import ConfigError, InputError
@@ -20,25 +17,12 @@ from chebsplat.stages.tools.get_teacher import get_teacher
 OTHER = "0" * 64
 
 
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *_):
-        pass
-
-
 class Cut(Quiet):
     """Says the whole length of a model, and sends a part."""
 
     def copyfile(self, source, outputfile):
         content = source.read()
         outputfile.write(content[:100] if self.path.endswith(".onnx") else content)
-
-
-@contextmanager
-def served(folder, handler=Quiet):
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=folder)) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
 
 
 @pytest.fixture
