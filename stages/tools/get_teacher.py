@@ -98,9 +98,12 @@ def get_teacher(
         lines = (f"{k} = {json.dumps(value, ensure_ascii=False)}\n" for k, value in values.items())
         graph_copy.with_suffix(".toml").write_text("".join(lines), encoding="utf-8")
         part.rename(folder)
-        findings = check(model)
     except BaseException:  # it is no teacher, or the user waits no longer
         shutil.rmtree(part, ignore_errors=True)
+        raise
+    try:
+        findings = check(model)
+    except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
     if expected is None and not origin.startswith("hf:"):

@@ -22,7 +22,6 @@ from chebsplat.formats.teacher_model import FILES, TEXT_PACKAGE, read_settings
 ADDRESS = re.compile(r"(?!hf:)(?:(?:https?|file):[^\s\[\]]+|.+\.(?:onnx|tflite))")
 SECONDS = 60.0  # that a server may be silent
 AGAIN = "run the same command again"
-TFLITE = b"TFL3"  # of a FlatBuffer, after the offset of its root
 
 
 def full_address(address: str) -> str:
@@ -33,8 +32,7 @@ def full_address(address: str) -> str:
 
 def stem_of(address: str) -> str:
     """The name of its file without the ending."""
-    path = _here(address)
-    return Path(urlsplit(address).path if path is None else path).stem
+    return _file(address).stem
 
 
 def gather(address: str, settings: str | None, graph: Path) -> dict[str, Any]:
@@ -46,6 +44,11 @@ def gather(address: str, settings: str | None, graph: Path) -> dict[str, Any]:
     Choices: a file is called by the encoder and its key, since a TOML of others may name any path;
       weights are called as their graph says.
     """
+    if _file(address).suffix == ".tflite":
+        raise InputError(
+            f"{address} is TFLite, which nothing here reads; convert it with `python -m "
+            "tf2onnx.convert --tflite FILE.tflite --output FILE.onnx`, and give that"
+        )
     toml = settings or _beside(address, f"{stem_of(address)}.toml")
     remedy = (
         "write a TOML with at least mean, std and labels (docs/teachers.md), and give it as "
@@ -101,15 +104,10 @@ def copy(address: str, place: Path, remedy: str) -> None:
 
 
 def check_graph(path: Path, address: str) -> None:
-    """Raises InputError on what is no ONNX graph: a page, a pointer to a file, TFLite."""
-    with path.open("rb") as file:
-        head = file.read(40)
-    if head[4:8] == TFLITE:
-        raise InputError(
-            f"{address} is TFLite, which nothing here reads; convert it with `python -m "
-            "tf2onnx.convert --tflite FILE.tflite --output FILE.onnx`, and give that"
-        )
+    """Raises InputError on what is no ONNX graph, as a page about it or a pointer to it."""
     if not is_graph(path):
+        with path.open("rb") as file:
+            head = file.read(40)
         raise InputError(
             f"{address} is no ONNX graph, it begins with {head!r}; give the address of the .onnx "
             "itself, not of a page about it"
@@ -122,6 +120,11 @@ def _here(address: str) -> Path | None:
     if parts.scheme in ("http", "https"):
         return None
     return Path(url2pathname(parts.path) if parts.scheme == "file" else address).expanduser()
+
+
+def _file(address: str) -> Path:
+    """The path in an address, with the name of its file."""
+    return _here(address) or Path(urlsplit(address).path)
 
 
 def _beside(address: str, name: str) -> str:

@@ -108,7 +108,6 @@ def last_axes(path):
 
 
 REFUSED = {
-    "TFLite": (lambda f: f.write_bytes(b"\x1c\0\0\0TFL3" + bytes(40)), "python -m tf2onnx.convert"),
     "a page": (lambda f: f.write_text("<!DOCTYPE html>"), "is no ONNX graph, it begins with b'<!"),
     "nothing": (lambda f: f.write_bytes(b""), "is no ONNX graph"),
     "another rank": (
@@ -144,11 +143,12 @@ def test_what_is_no_teacher_is_one_line_and_leaves_no_folder(place, tmp_path, ca
         ("http://nowhere.invalid/tiny.onnx", "no host called nowhere.invalid is found"),
         ("http://127.0.0.1:9/tiny.onnx", "is not reached .*connect and run"),
         ("http://127.0.0.1:x/tiny.onnx", "is not reached"),
+        ("http://127.0.0.1:9/tiny.tflite", "is TFLite, .*python -m tf2onnx.convert"),
         ("nowhere/tiny.onnx", "nowhere/tiny.toml is missing; write a TOML"),
         ("ftp://127.0.0.1/tiny.onnx", "is missing"),
     ],
 )
-def test_what_is_not_reached_is_one_line(place, address, word):
+def test_what_is_not_reached_or_read_is_one_line(place, address, word):
     with pytest.raises(InputError, match=word):
         get_teacher(address)
 
