@@ -29,9 +29,15 @@ def model_files(path: Path) -> list[Path]:
 
 
 def weight_files(path: Path) -> tuple[str, ...]:
-    """File names of a graph's external weights, relative to its folder."""
-    state = regular(path, EXPORT)
-    return _named(path, (state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns))
+    """File names of a graph's external weights, relative to its folder; none of what is no graph,
+    as onnxruntime reports that.
+    """
+    return _named(path, _stamp(path)) or ()
+
+
+def is_graph(path: Path) -> bool:
+    """True of an ONNX file, whatever its graph."""
+    return _named(path, _stamp(path)) is not None
 
 
 def model_sha256(path: Path) -> str:
@@ -40,15 +46,24 @@ def model_sha256(path: Path) -> str:
     return hashlib.sha256("\n".join([first, *others]).encode()).hexdigest() if others else first
 
 
+def _stamp(path: Path) -> tuple[int, ...]:
+    state = regular(path, EXPORT)
+    return state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns
+
+
 @lru_cache(maxsize=16)
-def _named(path: Path, stamp: tuple[int, ...]) -> tuple[str, ...]:
-    """Cached by `stamp`, which changes with the file: graphs may hold gigabytes."""
+def _named(path: Path, stamp: tuple[int, ...]) -> tuple[str, ...] | None:
+    """`weight_files`, None of what is no graph. Cached by `stamp`, which changes with the file:
+    graphs may hold gigabytes.
+    """
     import onnx
 
     try:
         model = onnx.load(path, load_external_data=False)
     except Exception:  # protobuf's own error, of a package that we do not depend on
-        return ()  # no graph; onnxruntime reports it
+        return None
+    if not model.ListFields():  # an empty file parses, too
+        return None
     external = onnx.TensorProto.EXTERNAL
     names = [
         os.path.normpath(entry.value)

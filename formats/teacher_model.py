@@ -116,11 +116,9 @@ def read_teacher(path: Path) -> TeacherModel:
             f"{settings} is missing; write it beside the model, with at least mean, std and "
             "labels (docs/teachers.md)"
         )
-    values = parse_toml(settings, "correct it (docs/teachers.md)")
-    for key, value in values.items():
-        _check(settings, key, value)
-    values = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in values.items()
+    values: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in read_settings(settings).items()
     }
     for key in FILES:
         if key in values and not (key == "text" and values[key] == TEXT_PACKAGE):
@@ -151,6 +149,14 @@ def read_teacher(path: Path) -> TeacherModel:
             f"{teacher.multiple}; correct one"
         )
     return teacher
+
+
+def read_settings(settings: Path) -> dict[str, Any]:
+    """The keys of a teacher's TOML, each of the kind that it has to be. Raises InputError."""
+    values = parse_toml(settings, "correct it (docs/teachers.md)")
+    for key, value in values.items():
+        _check(settings, key, value)
+    return values
 
 
 def _is_list(value: Any, kinds: tuple[type, ...], length: int, low: float, high: float) -> bool:

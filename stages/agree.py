@@ -64,7 +64,8 @@ def run(job: Job) -> None:
     elif value < settings.low:
         job.facts["doubt"] = (
             f"views agree by {value:.2f} on what points are (1: always, 0: by chance), below "
-            f"{settings.low:g}: the 2D teacher does not know this scene; name another "
+            f"{settings.low:g}: the 2D teacher does not know this scene, or its mean, std or order "
+            "of colours is wrong (`chebsplat check-teacher` tries the usual ones); name another "
             "(docs/teachers.md), or teacher.kind=none for colour alone"
         )
         log.warning("%s", job.facts["doubt"])

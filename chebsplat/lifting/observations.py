@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from chebsplat.lifting import kernels
-from chebsplat.rasterize import CELL
+from chebsplat.rasterize.cells import CELL
 from chebsplat.rasterize.lift import Lifted
 
 N_BLOCKS = 8  # of views in order, taken in turn by the halves

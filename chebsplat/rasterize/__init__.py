@@ -7,12 +7,10 @@ channels. May import kernels, splats.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor
-
-from chebsplat.rasterize.projection import CELL
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def rasterize(
@@ -25,6 +23,8 @@ def rasterize(
         reference.
     Raises: ValueError on an unknown backend, or tensors that the chosen one does not take.
     """
+    import torch  # takes a second, and others here need none of it
+
     if backend == "auto":
         on_cpu = "cpu" if means.dtype == torch.float32 else "reference"
         backend = {"cuda": "cuda", "cpu": on_cpu}.get(means.device.type, "reference")
@@ -40,6 +40,3 @@ def rasterize(
         raise ValueError(f"backend {backend!r} is none of auto, cpu, cuda, reference")
     rendered: tuple[Tensor, Tensor, dict[str, Any]] = module.rasterize(means, *args, **options)
     return rendered
-
-
-__all__ = ["CELL", "rasterize"]

@@ -30,7 +30,8 @@ from chebsplat.kernels.simd import (
 )
 from chebsplat.rasterize.blocks import hits_among, multiply
 
-LANES = 16
+CELL = 4  # pixels, the side of a cell of `cell_colors`
+LANES = CELL**2
 load_1, load_4, splat_1 = load_of(1), load_of(4), splat_of(1)
 SHAPE = 8  # floats of a row of shapes, and of a splat, before its channels
 N_GEOMETRY = 8  # floats of a record before its channels (see `cell_adjoint`)

@@ -10,7 +10,6 @@ from torch import Tensor
 from chebsplat.splats.rotations import rotation_matrices
 
 EXTENT = 3.33  # in σ: there even a Gaussian of opacity 1 has fallen to 1/255, √(2 ln 255)
-CELL = 4  # pixels, the side of a cell of `cell_colors`
 LEAST_KEPT = 0.005  # of an opacity that is compensated: 3DGS's and gsplat's floor
 # of a projected variance, pixels²: more is culled, so that float32 can hold what is made of it
 LARGEST = 1e30

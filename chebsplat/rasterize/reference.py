@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import hardshrink
 
-from chebsplat.rasterize.projection import CELL, Projected, compensated, is_antialiased, project
+from chebsplat.rasterize.cells import CELL
+from chebsplat.rasterize.projection import Projected, compensated, is_antialiased, project
 
 ALPHA_MIN = 1 / 255  # fainter contributions are skipped
 T_MIN = 1e-4  # compositing stops before transmittance falls to this

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
-from chebsplat.rasterize import CELL, rasterize
+from chebsplat.rasterize import rasterize
+from chebsplat.rasterize.cells import CELL
 from chebsplat.rasterize.cuda import made_harmless
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.splats.gaussians import take

@@ -70,13 +70,23 @@ def check_teacher(model: Path, photos: tuple[Path, ...], labels: str | None) -> 
     "graph",
     default="onnx/model.onnx",
     show_default=True,
-    help="the ONNX file in the repository",
+    help="the ONNX file in the hub's repository",
 )
-def get_teacher(name: str, out: Path | None, graph: str) -> None:
-    """Fetch a segmenter from the Hugging Face hub: segformer-b0-ade or hf:OWNER/NAME[@REVISION]."""
+@click.option(
+    "--settings",
+    metavar="FILE|URL",
+    help="the TOML of an ONNX file that brings none beside it",
+)
+@click.option("--sha256", help="that the model must have")
+def get_teacher(
+    name: str, out: Path | None, graph: str, settings: str | None, sha256: str | None
+) -> None:
+    """Fetch a 2D teacher: a segmenter of the Hugging Face hub (segformer-b0-ade,
+    hf:OWNER/NAME[@REVISION]), or any .onnx by its URL or path, with the TOML beside it.
+    """
     from chebsplat.stages.tools.get_teacher import get_teacher as fetch
 
-    model, findings = fetch(name, out, graph)
+    model, findings = fetch(name, out, graph, settings, sha256)
     for what, finding in findings:
         print(f"{what:9s}{finding}", file=sys.stderr)
     print(f"use it: set=teacher.model={model},teacher.n_channels=32", file=sys.stderr)

@@ -38,6 +38,11 @@ HOW = (
     "rooms only"
 )
 
+LATER = (
+    "to name what is in it, without training again: the same command with "
+    "set=teacher.model=MODEL.onnx,train.features=lifted"
+)
+
 
 def teacher_kind(config: Any, source: str, probe: dict[str, bool]) -> tuple[str, str]:
     """The teacher's kind after `auto` is resolved, and the reason where it is none.

@@ -18,6 +18,7 @@ from typing import Any
 
 from chebsplat.formats.files import atomic_write, explained
 from chebsplat.pipelines.planning.forecast import forecast, sentence
+from chebsplat.pipelines.planning.needs import LATER, UNASKED
 from chebsplat.pipelines.planning.plan import Plan, Step
 from chebsplat.pipelines.running import cluster, job, processes
 from chebsplat.pipelines.work import heads, leases, store, summary
@@ -104,6 +105,8 @@ def say_result(plan: Plan, stage: str | None) -> None:
             say(f"  {line}")
         for doubt in summary.doubts(plan.targets):
             say(f"  doubtful: {doubt}")
+        if plan.left_out.get("teacher", "").startswith(UNASKED):
+            say(f"  {LATER}")
     link = store.work() / plan.title / last.stage
     print(summary.readable(link / "report.html" if last.stage == "report" else link))
 

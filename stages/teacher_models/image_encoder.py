@@ -204,7 +204,10 @@ class TeacherInference:
         teacher = self.teacher
         mean, std = (np.array(v, np.float32)[:, None, None] for v in (teacher.mean, teacher.std))
         fed = window[..., ::-1] if teacher.order == "BGR" else window
-        image = (fed.transpose(2, 0, 1).astype(np.float32) / 255 - mean) / std
+        image = fed.transpose(2, 0, 1).astype(np.float32, order="C")
+        image /= 255
+        image -= mean
+        image /= std
         outputs = self.model.run({self.model.inputs[0].name: image[None]})
         if self._place is None:
             self._place, self._last = self._place_of(outputs)

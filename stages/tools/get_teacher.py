@@ -1,5 +1,5 @@
-"""A closed-set segmenter from the Hugging Face hub, or its cache, as the three files of a teacher;
-and a trial of a teacher on an image before a scene: its settings, cost and labels.
+"""A teacher in a folder of its own, from the Hugging Face hub, or its cache, or by the address of
+an ONNX file; and a trial of a teacher on an image before a scene: its settings, cost and labels.
 """
 
 from __future__ import annotations
@@ -11,13 +11,14 @@ import re
 import shutil
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
 import numpy as np
 
-from chebsplat.errors import ChebsplatError, ConfigError, InputError
+from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.extras import require
 from chebsplat.formats.files import parse_json
@@ -29,6 +30,13 @@ from chebsplat.labels.tiling import window_starts
 from chebsplat.stages.runtime.command import n_threads
 from chebsplat.stages.settings import MAX_CHANNELS, TeacherSection
 from chebsplat.stages.teacher_models.label_space import closed_set, label_set, open_vocabulary
+from chebsplat.stages.tools.teacher_files import (
+    ADDRESS,
+    AGAIN,
+    full_address,
+    gather,
+    stem_of,
+)
 from chebsplat.synthetic.layout import REFERENCE
 
 TEACHERS = {
@@ -41,56 +49,97 @@ STEPS = (  # of an image processor: those that keys of a TOML replace, and those
     "resize", "center_crop", "rescale", "normalize", "flip_channel_order", "convert_rgb",
     "reduce_labels", "pad",
 )  # fmt: skip
-AGAIN = "run the same command again"
 N_LABELS, N_PHOTOS = 8, 8  # of a trial
 
 
 def get_teacher(
-    name: str, out: Path | None = None, graph: str = GRAPH
+    name: str,
+    out: Path | None = None,
+    graph: str = GRAPH,
+    settings: str | None = None,
+    sha256: str | None = None,
 ) -> tuple[Path, list[tuple[str, str]]]:
-    """Fetch a teacher into a folder as NAME.onnx, .toml and .txt; the .onnx, and `check` of it.
+    """Fetch a teacher into a folder as NAME.onnx, .toml and its labels; the .onnx, and `check` of
+    it.
 
-    Args: name: of TEACHERS, or hf:OWNER/NAME[@REVISION]; out: the folder, otherwise one called like
-      the teacher, here; graph: the ONNX file in the repository.
+    Args: name: of TEACHERS, hf:OWNER/NAME[@REVISION], or the address of an ONNX file; out: the
+      folder, otherwise one called like the teacher, here; graph: the ONNX file in the repository;
+      settings: the address of the TOML of one that is not from the hub, None: beside it; sha256:
+      that the model must have (`model_sha256`), None: that of its TOML, if it says one.
     Raises: ConfigError on a name or folder that cannot be; InputError naming what is missing,
       damaged or not reached.
     """
-    repository, revision, short = parsed(name)
+    if ADDRESS.fullmatch(name):
+        origin, short = full_address(name), stem_of(name)
+        fill = partial(gather, name, settings)
+    else:
+        repository, revision, short = parsed(name)
+        if settings is not None:
+            raise ConfigError(f"--settings is of an address, and {name} brings its own; leave it")
+        origin = f"hf:{repository}@{revision}/{graph}"
+        fill = partial(from_hub, repository, revision, graph)
     folder = out or Path(short)
     model = folder / f"{short}.onnx"
-    origin = f"hf:{repository}@{revision}/{graph}"
     if folder.exists():
         if not model.is_file() or read_teacher(model).origin != origin:
             raise ConfigError(
                 f"{folder} exists and is not {origin}; remove it, or choose another --out"
             )
+        compare(sha256, model, origin)
         return model, check(model)
-    files = {file: fetch_file(repository, file, revision) for file in (CLASSES, PREPARATION, graph)}
-    weights = {
-        name: fetch_file(repository, f"{PurePosixPath(graph).parent / name}", revision)
-        for name in weight_files(files[graph])
-    }
     part = folder.with_name(f".part-{folder.name}")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
     try:
         graph_copy = part / model.name
-        shutil.copyfile(files[graph], graph_copy)
-        for name, file in weights.items():
-            (part / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, part / name)
-        classes = class_names(files[CLASSES], repository)
-        graph_copy.with_suffix(".txt").write_text("\n".join(classes) + "\n", encoding="utf-8")
-        values = {"name": short, "output": "logits", "labels": f"{short}.txt", "origin": origin}
-        values |= {"sha256": model_sha256(graph_copy)} | preparation(files[PREPARATION], repository)
+        values = {"name": short} | fill(graph_copy)
+        compare(expected := sha256 or values.get("sha256"), graph_copy, origin)
+        values |= {"origin": origin, "sha256": model_sha256(graph_copy)}
         lines = (f"{k} = {json.dumps(value, ensure_ascii=False)}\n" for k, value in values.items())
         graph_copy.with_suffix(".toml").write_text("".join(lines), encoding="utf-8")
         part.rename(folder)
-        return model, check(model)
-    except ChebsplatError:  # it is no teacher
+    except BaseException:  # it is no teacher, or the user waits no longer
         shutil.rmtree(part, ignore_errors=True)
+        raise
+    try:
+        findings = check(model)
+    except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
+    if expected is None and not origin.startswith("hf:"):
+        digest = values["sha256"]
+        remark = "compare it with its publisher's; to get no other, add --sha256"
+        findings.append(("sha256", f"{digest}; {remark} {digest}"))
+    return model, findings
+
+
+def compare(sha256: str | None, model: Path, origin: str) -> None:
+    """Raises InputError where a model has not the checksum that was asked for, if one was."""
+    if sha256 is not None and (digest := model_sha256(model)) != sha256.lower():
+        raise InputError(
+            f"{origin} has the sha256 {digest}, {sha256} was asked for: it is another file, or was "
+            "damaged on the way; compare with its publisher's"
+        )
+
+
+def from_hub(repository: str, revision: str, graph: str, model: Path) -> dict[str, Any]:
+    """Copy a repository's graph to `model`, its weights and its classes beside; values of a TOML.
+
+    Raises: InputError naming what is missing, damaged or not reached.
+    """
+    files = {file: fetch_file(repository, file, revision) for file in (CLASSES, PREPARATION, graph)}
+    weights = {
+        name: fetch_file(repository, f"{PurePosixPath(graph).parent / name}", revision)
+        for name in weight_files(files[graph])
+    }
+    shutil.copyfile(files[graph], model)
+    for name, file in weights.items():
+        (model.parent / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, model.parent / name)
+    labels = model.with_suffix(".txt")
+    classes = class_names(files[CLASSES], repository)
+    labels.write_text("\n".join(classes) + "\n", encoding="utf-8")
+    return {"output": "logits", "labels": labels.name} | preparation(files[PREPARATION], repository)
 
 
 def parsed(name: str) -> tuple[str, str, str]:
@@ -100,7 +149,8 @@ def parsed(name: str) -> tuple[str, str, str]:
     if not (match := REPOSITORY.fullmatch(name)):
         names = ", ".join(TEACHERS)
         raise ConfigError(
-            f"{name[:100]!a} is no teacher; there are {names}, and hf:OWNER/NAME[@REVISION]"
+            f"{name[:100]!a} is no teacher; there are {names}, hf:OWNER/NAME[@REVISION], and ONNX "
+            "files by https: or path"
         )
     return match[1], match[2] or "main", match[1].rpartition("/")[2].lower()
 

@@ -166,8 +166,9 @@ class OpenedScene:
         if self.features is None:
             raise ConfigError(
                 f"{self.source} has colours alone: no 2D teacher has said what things are; make "
-                f"scene={shlex.quote(str(self.source))} set=teacher.model=MODEL.onnx (chebsplat "
-                "get-teacher segformer-b0-ade fetches one), of a splat: chebsplat lift --capture"
+                f"scene={shlex.quote(str(self.source))} set=teacher.model=MODEL.onnx,"
+                "train.features=lifted (chebsplat get-teacher segformer-b0-ade fetches one), of a "
+                "splat: chebsplat lift --capture"
             )
         if self._teacher is None:
             raise ConfigError(

@@ -99,6 +99,7 @@ def test_the_stage_warns_of_a_teacher_that_says_one_thing_and_records_it(tmp_pat
         line for line in capsys.readouterr().err.splitlines() if "does not know this scene" in line
     ]
     assert len(told) == 1 and facts["doubt"] in told[0] and "docs/teachers.md" in told[0]
+    assert "check-teacher" in told[0]
     assert run_stage("agree", tmp_path / "calm", inputs, {"agree": {"low": 0.0}}) == 0
     assert "doubt" not in read_manifest(tmp_path / "calm").facts
 

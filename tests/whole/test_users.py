@@ -12,10 +12,13 @@ from importlib.util import find_spec
 
 import pytest
 from PIL import Image
+from served import served
 from shared import ROOT, run_stage
+from tiny_teachers import COLORS, color_teacher
 
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.extras import EXTRAS
+from chebsplat.formats.onnx_files import model_sha256
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("users")]
 COMMAND = re.compile(r"^    (?:\.venv/bin/)?((?:chebsplat|make) .*?)(?:\s+# .*)?$", re.MULTILINE)
@@ -91,7 +94,7 @@ def check(place, texts, **names):
     assert not wrong, "\n".join(wrong)
 
 
-def test_who_has_photos_gets_a_scene_of_colours_and_is_told_how_to_name_it(place):
+def test_who_has_photos_gets_a_scene_of_colours_and_names_it_as_its_last_lines_say(place):
     photos = f"{place}/photos/"
     texts = [text for text in commands("README.md") if "path/to/folder" in text]
     assert len(texts) == 2
@@ -99,8 +102,24 @@ def test_who_has_photos_gets_a_scene_of_colours_and_is_told_how_to_name_it(place
         code, output = typed(place, f"{text} set={PHOTO_STEPS}", **{"path/to/folder/": photos})
         assert code == 0, output[-2000:]
     assert re.search(r"report.*\.html", output) and "teacher" in output
+    told = re.search(r"the same command with set=(teacher\.model)=MODEL\.onnx,(\S+)", output)
     code, output = typed(place, "chebsplat query photos sofa")
-    assert code == 2 and "get-teacher" in output
+    assert code == 2 and "get-teacher" in output and f"MODEL.onnx,{told[2]}" in output
+    (place / "web").mkdir()
+    model = color_teacher(place / "web", output="logits", labels="colors.txt")
+    (place / "web/colors.txt").write_text("\n".join(COLORS) + "\n")
+    with served(place / "web") as server:
+        command = f"chebsplat get-teacher {server}/{model.name} --sha256 {model_sha256(model)}"
+        code, output = typed(place, command)
+    assert code == 0, output
+    settings = f"{PHOTO_STEPS},{told[1]}={place}/tiny/tiny.onnx,{told[2]}"
+    code, output = typed(place, f"make scene={photos} set={settings}")
+    assert code == 0, output[-2000:]
+    ran = re.search(r"to run: (.*?)   fresh", output)[1].split()
+    assert {"teacher", "lift", "export"} <= {*ran} and not {"sfm", "train"} & {*ran}
+    scene = re.search(r"(\S+)/report/report\.html", output)[1]
+    code, output = typed(place, f"chebsplat query {scene} red")
+    assert code == 0 and "red" in output, output
 
 
 @pytest.fixture(scope="module")

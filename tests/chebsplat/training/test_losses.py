@@ -12,6 +12,7 @@ from chebsplat.training.losses import (
     photometric,
     photometric_reference,
     ssim,
+    ssim_map,
 )
 
 
@@ -60,6 +61,12 @@ def test_masked_pixels_have_no_influence_and_no_gradient():
         values.append(value.item())
     assert values[0] == values[1]
     assert photometric(render, target, torch.zeros_like(mask), 0.2).item() == 0
+
+
+def test_ssim_of_pictures_is_that_of_the_loss():
+    a, b = np.random.default_rng(0).integers(0, 255, (2, 30, 40, 3), dtype=np.uint8)
+    doubles = (torch.from_numpy(image).double() / 255 for image in (a, b))
+    assert ssim(a, b) == pytest.approx(float(ssim_map(*doubles).mean()), abs=1e-13)  # rounding
 
 
 def test_ssim_of_equal_images_is_one():

@@ -1,0 +1,172 @@
+"""Teachers by the address of their ONNX file: a path, a file: URL, and a server of our own."""
+
+import os
+
+import numpy as np
+import onnx
+import pytest
+from onnx import helper
+from served import Quiet, served
+from tiny_teachers import COLORS, color_teacher, moved_out, write_model
+
+from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.onnx_files import model_sha256
+from chebsplat.formats.teacher_model import read_teacher
+from chebsplat.stages.tools.get_teacher import get_teacher
+
+OTHER = "0" * 64
+
+
+class Cut(Quiet):
+    """Says the whole length of a model, and sends a part."""
+
+    def copyfile(self, source, outputfile):
+        content = source.read()
+        outputfile.write(content[:100] if self.path.endswith(".onnx") else content)
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A segmenter of colours on offer, in a folder whose name a URL has to quote, a folder to stand
+    in, and a small photo for the check.
+    """
+    photo = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    monkeypatch.setattr("chebsplat.stages.tools.get_teacher.read_photo", lambda _: ("photo", photo))
+    (tmp_path / "on offer").mkdir()
+    (tmp_path / "here").mkdir()
+    model = color_teacher(tmp_path / "on offer", output="logits", labels="the colours.txt")
+    (model.parent / "the colours.txt").write_text("\n".join(COLORS) + "\n")
+    monkeypatch.setenv("no_proxy", "*")
+    monkeypatch.chdir(tmp_path / "here")
+    return model
+
+
+def toml(model, **values):
+    lines = dict(
+        line.split(" = ", 1) for line in model.with_suffix(".toml").read_text().splitlines()
+    )
+    lines |= values
+    model.with_suffix(".toml").write_text("".join(f"{k} = {v}\n" for k, v in lines.items()))
+
+
+@pytest.mark.parametrize("kind", ["path", "file", "http"])
+@pytest.mark.parametrize("features", [False, True])
+def test_an_onnx_file_becomes_a_teacher_wherever_it_lies(place, tmp_path, kind, features):
+    if features:
+        toml(place, output='"features"', labels='"tiny.npz"')
+    moved_out(place, "weights.bin")
+    with served(place.parent) as server:
+        address = {
+            "path": "../on offer/tiny.onnx",
+            "file": place.as_uri(),
+            "http": f"{server}/tiny.onnx?download=true",
+        }[kind]
+        model, findings = get_teacher(address)
+        again = get_teacher(address, sha256=model_sha256(place).upper())
+    assert str(model) == "tiny/tiny.onnx" and again[0] == model
+    kept = "tiny.labels.npz" if features else "tiny.labels.txt"
+    names = {"tiny.onnx", "tiny.toml", "weights.bin", kept}
+    assert {path.name for path in model.parent.iterdir()} == names
+    found, origin = read_teacher(model), address if kind == "http" else str(place)
+    assert (found.mean, found.multiple) == ((0.5,) * 3, 4)
+    assert os.path.realpath(found.origin) == os.path.realpath(origin)
+    assert found.sha256 == model_sha256(place) and found.labels == model.with_name(kept)
+    assert f"--sha256 {found.sha256}" in dict(findings)["sha256"] and "sees" in dict(findings)
+    assert "sha256" not in dict(again[1])
+    assert not list(tmp_path.rglob(".part-*"))
+
+
+def test_what_brings_no_toml_takes_the_user_s_own(place, tmp_path):
+    (tmp_path / "mine").mkdir()
+    for name in ("tiny.toml", "the colours.txt"):
+        (place.parent / name).rename(tmp_path / "mine" / name)
+    with served(place.parent) as server:
+        with pytest.raises(InputError, match=r"answers 404; write a TOML .* --settings FILE.toml"):
+            get_teacher(f"{server}/tiny.onnx")
+        model, _ = get_teacher(f"{server}/tiny.onnx", settings="../mine/tiny.toml")
+    assert read_teacher(model).labels.read_text().split() == list(COLORS)
+
+
+def test_a_checksum_that_was_asked_for_is_compared(place, tmp_path):
+    toml(place, sha256=f'"{OTHER}"')
+    with pytest.raises(InputError, match=f"{OTHER} was asked for"):
+        get_teacher(str(place))  # by its publisher's TOML
+    with pytest.raises(InputError, match=f"{'1' * 64} was asked for"):
+        get_teacher(str(place), sha256="1" * 64)
+    assert not list((tmp_path / "here").iterdir())
+    model, _ = get_teacher(str(place), sha256=model_sha256(place))
+    with pytest.raises(InputError, match=f"{OTHER} was asked for"):
+        get_teacher(str(place), sha256=OTHER)
+    assert model.is_file()
+
+
+def last_axes(path):
+    model = onnx.load(path)
+    model.graph.output[0].name = "flat"
+    model.graph.node.append(helper.make_node("Flatten", ["features"], ["flat"]))
+    onnx.save(model, path)
+
+
+REFUSED = {
+    "a page": (lambda f: f.write_text("<!DOCTYPE html>"), "is no ONNX graph, it begins with b'<!"),
+    "nothing": (lambda f: f.write_bytes(b""), "is no ONNX graph"),
+    "another rank": (
+        lambda f: write_model(f, [helper.make_node("Identity", ["image"], ["features"])],
+                              shape=(1, 3, "N")),
+        r"one image \[1, 3, H, W\] is needed",
+    ),
+    "no class map": (last_axes, r"\[1, C, h, w\] is needed"),
+    "other classes": (lambda f: (f.parent / "the colours.txt").write_text("red\n"), "3 channels"),
+    "no model": (lambda f: f.unlink(), "answers 404; correct the address"),
+    "no labels": (lambda f: (f.parent / "the colours.txt").unlink(), "answers 404; correct"),
+    "a date in the TOML": (lambda f: toml(f, mean="1979-05-27"), "three numbers"),
+    "weights that are missing": (
+        lambda f: (moved_out(f, "weights.bin"), (f.parent / "weights.bin").unlink()),
+        "keeps weights there",
+    ),
+    "weights in the place of labels": (lambda f: moved_out(f, "tiny.labels.txt"), "of two files"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_is_no_teacher_is_one_line_and_leaves_no_folder(place, tmp_path, case):
+    damage, word = REFUSED[case]
+    damage(place)
+    with served(place.parent) as server, pytest.raises(InputError, match=word) as error:
+        get_teacher(f"{server}/tiny.onnx")
+    assert "\n" not in str(error.value) and not list((tmp_path / "here").iterdir())
+
+
+@pytest.mark.parametrize(
+    ("address", "word"),
+    [
+        ("http://nowhere.invalid/tiny.onnx", "no host called nowhere.invalid is found"),
+        ("http://127.0.0.1:9/tiny.onnx", "is not reached .*connect and run"),
+        ("http://127.0.0.1:x/tiny.onnx", "is not reached"),
+        ("http://127.0.0.1:9/tiny.tflite", "is TFLite, .*python -m tf2onnx.convert"),
+        ("nowhere/tiny.onnx", "nowhere/tiny.toml is missing; write a TOML"),
+        ("ftp://127.0.0.1/tiny.onnx", "is missing"),
+    ],
+)
+def test_what_is_not_reached_or_read_is_one_line(place, address, word):
+    with pytest.raises(InputError, match=word):
+        get_teacher(address)
+
+
+def test_a_download_that_broke_off_is_no_teacher(place, tmp_path):
+    with served(place.parent, Cut) as server, pytest.raises(InputError, match="broke off at 100"):
+        get_teacher(f"{server}/tiny.onnx")
+    assert not list((tmp_path / "here").iterdir())
+
+
+def test_a_toml_of_others_takes_no_file_of_ours(place, tmp_path):
+    (tmp_path / "secret.txt").write_text("\n".join(COLORS))
+    for name in (str(tmp_path / "secret.txt"), "../secret.txt", (tmp_path / "secret.txt").as_uri()):
+        toml(place, labels=f'"{name}"')
+        with served(place.parent) as server, pytest.raises(InputError, match="answers 404"):
+            get_teacher(f"{server}/tiny.onnx")
+
+
+def test_the_settings_of_the_hub_s_models_are_their_own():
+    with pytest.raises(ConfigError, match="brings its own"):
+        get_teacher("segformer-b0-ade", settings="a.toml")
