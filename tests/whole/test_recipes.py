@@ -31,7 +31,7 @@ def extended(tmp_path):
         path = copy / name.removeprefix("chebsplat/")
         if path.exists():  # a row
             before, last, after = path.read_text().partition('        Stage("report"')
-            text = before + text + last + after
+            text = f"{before}{text.rstrip()},\n{last}{after}"
         path.write_text(text)
 
     def run(*words):
