@@ -13,7 +13,7 @@ import click
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.splats import is_splat
-from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath
+from chebsplat.pipelines.cli.group import AGAINST, SCENE, UP, NewPath
 
 VIDEO = ".mp4"
 PATHS = "flight (along the capture's cameras, smoothed and level; of a splat alone within it), \
@@ -57,7 +57,7 @@ class FramesPath(click.ParamType):
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option(
     "--path",
     default="auto",
@@ -113,7 +113,7 @@ def render(
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option("--path", default="capture", show_default=True, help=PATHS)
 @FRAMES
 @UP
@@ -152,7 +152,7 @@ def cameras(
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option("--out", type=NewPath(), required=True, help="the .html to write")
 @SH
 @WORDS
@@ -164,7 +164,7 @@ def page(scene: str, out: Path, sh: int, words: Path | None, against: list[str],
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @SH
 @WORDS
 @AGAINST

@@ -11,7 +11,7 @@ import click
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.splats import WRITTEN
-from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath, Phrases, Upward
+from chebsplat.pipelines.cli.group import AGAINST, SCENE, UP, NewPath, Phrases, Upward
 
 
 def report(figures: Mapping[str, Any], out: Path) -> None:
@@ -21,7 +21,7 @@ def report(figures: Mapping[str, Any], out: Path) -> None:
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.argument("text")
 @AGAINST
 @click.option(
@@ -84,7 +84,7 @@ def get_teacher(name: str, out: Path | None, graph: str) -> None:
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option("--out", type=NewPath(*WRITTEN), required=True, help="the .ply, .spz, .sog or .glb")
 @click.option(
     "--keep-label", "labels", multiple=True, help="a name of labels.json; may be given again"
@@ -115,7 +115,7 @@ def extract(
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option(
     "--as",
     "kind",
@@ -251,7 +251,7 @@ def label(
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option(
     "--out", type=NewPath(".ply", ".glb"), required=True, help="the .ply or .glb to write"
 )
