@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -129,7 +128,7 @@ def test_make_says_the_code_that_it_cannot_leave_with():
         ("chebsplat study paper", "paper-tables"),
     ],
 )
-def test_a_shell_completes_commands_and_names_of_scenes(words, found, quick_plans):
+def test_a_shell_completes_commands_and_names_of_scenes(words, found, quick_plans, tmp_path):
     """As docs/usage.md says; quick_plans: of a work folder of its own."""
     page = (ROOT / "docs/usage.md").read_text().replace(".venv/bin/", "")
     line = re.search(r"^    (eval .*bash_source.*?) +#", page, re.MULTILINE)
@@ -138,9 +137,13 @@ def test_a_shell_completes_commands_and_names_of_scenes(words, found, quick_plan
         (quick_plans / name / "ingest/artifact.json").touch()
     typed = f"COMP_WORDS=({words}); COMP_CWORD={len(words.split()) - 1}"
     script = f'{line[1]}; {typed}; _chebsplat_completion chebsplat; echo "${{COMPREPLY[@]}}"'
-    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    command = tmp_path / "bin/chebsplat"  # as pip makes it
+    command.parent.mkdir()
+    command.write_text(f"#!{sys.executable}\nfrom chebsplat.pipelines.cli import main\nmain()\n")
+    command.chmod(0o755)
+    there = {"PATH": f"{command.parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
-        ["bash", "-c", script], env=os.environ | {"PATH": path}, capture_output=True, text=True
+        ["bash", "-c", script], env=os.environ | there, capture_output=True, text=True
     )
     assert (done.stdout.strip(), done.returncode) == (found, 0), done.stderr
 
