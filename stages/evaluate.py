@@ -49,11 +49,11 @@ def run(job: Job) -> None:
     settings = job.config.evaluate
     capture, scene = Capture.read(job.inputs["capture"]), Scene.read(job.inputs["scene"])
     named = str(capture.protocol.get("name"))
-    protocol = protocols.ALL.get(named)
-    if protocol is None:
+    if named not in protocols.NAMES:
         raise ConfigError(
             f"{job.inputs['capture']}: its protocol {named:.60} is unknown; ingest it again"
         )
+    protocol = protocols.load(named)
     if capture.size != (scene.cameras.width, scene.cameras.height):
         raise InputError(
             f"{job.inputs['scene']} has cameras of another size than the capture; "
@@ -63,7 +63,7 @@ def run(job: Job) -> None:
         load_lpips(Path(settings.lpips_weights).expanduser()) if settings.lpips_weights else None
     )
     row = {name: view for view, name in enumerate(capture.names)}
-    evaluated = capture.is_test if not protocol.ON_TRAINING else ~capture.is_test
+    evaluated = capture.is_test if not protocol.RULE.on_training else ~capture.is_test
     places = [
         k for k, name in enumerate(scene.cameras.names) if name in row and evaluated[row[name]]
     ]
@@ -130,7 +130,7 @@ def segmented(
     if scene.labels is None:
         job.left_out("segmentation", "the scene has no semantics")
         return None
-    if protocol.TRUTH == "labels" and (capture.labels is None or capture.class_names is None):
+    if protocol.RULE.truth == "labels" and (capture.labels is None or capture.class_names is None):
         job.left_out("mIoU", "the capture has no labels to compare with")
         return {}
     figures: dict[str, Any] = protocol.measure(views, task(job, capture, scene, renderer))
@@ -142,7 +142,7 @@ def segmented(
             "3D point mIoU",
             too_little(rests) if rests["classes"] else "the capture has no depth with poses",
         )
-    if protocol.TRUTH == "labels":
+    if protocol.RULE.truth == "labels":
         figures["unmatched"] = unmatched(scene.label_names or [], capture.class_names or [])
     return figures
 

@@ -119,20 +119,21 @@ def split(names: list[str], own: Any, settings: IngestSection) -> tuple[Any, dic
     Raises: ConfigError if the config changes a rule that is part of a protocol's name; DataFailure
       if it leaves no test or no training view.
     """
-    rule = protocols.ALL[settings.protocol]
+    rule = protocols.load(settings.protocol).RULE
     requested = {"test_every": settings.test_every, "test_offset": settings.test_offset}
-    fixed = {"test_every": rule.TEST_EVERY, "test_offset": rule.TEST_OFFSET}
+    fixed = {"test_every": rule.test_every, "test_offset": rule.test_offset}
     used = {key: fixed[key] if value is None else value for key, value in requested.items()}
-    if used != fixed and not rule.ADJUSTABLE:
+    if used != fixed and not rule.adjustable:
         raise ConfigError(
-            f"ingest.protocol {rule.NAME} tests other views; leave test_every and test_offset away"
+            f"ingest.protocol {settings.protocol} tests other views; leave test_every and "
+            "test_offset away"
         )
-    record: dict[str, Any] = {"name": rule.NAME}
-    if rule.ON_TRAINING:
+    record: dict[str, Any] = {"name": settings.protocol}
+    if rule.on_training:
         return np.zeros(len(names), bool), record | {
             "split": "no view is held out; all are evaluated"
         }
-    if own is not None and rule.OWN_SPLIT:
+    if own is not None and rule.own_split:
         return own, record | {"split": "the source's own"}
     step, offset = used["test_every"], used["test_offset"] % used["test_every"]
     by_index = {

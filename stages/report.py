@@ -23,27 +23,13 @@ from chebsplat.stages.pages import pictures as draw
 from chebsplat.stages.pages.measures import course_of, row_of, stops
 from chebsplat.stages.pages.parts import REPORT, rendered
 from chebsplat.stages.pages.started import started
+from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.command import Job
 
 N_PICTURES = 4  # test views in the report
 LARGEST = 20_000_000  # bytes of the page
-STAGE_OF = {
-    "model": "pose",
-    "capture": "ingest",
-    "points": "sfm",
-    "channels": "channels",
-    "features": "teacher",
-    "agreement": "agree",
-    "descriptors": "describe",
-    "encoding": "encode",
-    "learned": "learn",
-    "knowledge": "recall",
-    "encoder": "onnx",
-    "gaussians": "train",
-    "lifted": "lift",
-    "refined": "refine",
-    "scene": "export",
-    "evaluation": "evaluate",
+STAGE_OF = {  # by role, in the order of the stages
+    role: stage for stage in STAGES for role, of in STAGES["report"].roles.items() if of == stage
 }
 BYTES = {
     "unpruned_ply": "plain 3DGS: every SH band, nothing else",

@@ -9,18 +9,11 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
+from chebsplat.evaluation import protocols
 from chebsplat.formats.names import unprintable
 from chebsplat.settings import Section, number, seed, setting
 
 MAX_CHANNELS = 64  # that can be rendered
-SIDES = {  # pixels: the longest side of a protocol's views
-    "labels": 640,
-    "replica-f3": 640,
-    "replica-gt": 640,
-    "scannet-open": 648,
-    "scannet-closed": 592,
-    "deep-blending": 1600,
-}
 
 
 def printable(text: str) -> str:
@@ -59,9 +52,9 @@ class SourceSection(Section):
 
 
 class IngestSection(Section):
-    protocol: Literal[
-        "labels", "replica-f3", "replica-gt", "scannet-open", "scannet-closed", "deep-blending"
-    ] = setting("labels", "how the scene is measured: classes, and which views are tested")
+    protocol: Literal[*protocols.NAMES] = setting(  # type: ignore[valid-type]
+        "labels", "how the scene is measured: classes, and which views are tested"
+    )
     test_every: int | None = number(
         None, "every so many views one is tested; default: the protocol's own", 2, 10_000
     )
@@ -69,7 +62,7 @@ class IngestSection(Section):
         None, "the first view that is tested; default: the protocol's own", 0, 10_000
     )
     max_side: int = Field(
-        default_factory=lambda values: SIDES[values.get("protocol", "labels")],
+        default_factory=lambda values: protocols.load(values.get("protocol", "labels")).RULE.side,
         description="pixels; images are reduced to this, never enlarged; default: the protocol's "
         "own",
         ge=16,

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import fpsample
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -71,12 +70,15 @@ def regions_of(points: Tensor, count: int, size: int, generator: torch.Generator
 def _farthest_points(places: np.ndarray, count: int, start: int) -> np.ndarray:
     """Indices [M] of points, each the farthest from those before; fewer where points coincide."""
     centered = (places - places.mean(0)).astype(np.float32)
-    height = int(np.clip(np.log2(max(len(places), 2)) - 4, 1, 9))
-    picked = np.array([start])
-    if len(places) > 1:
-        picked = fpsample.bucket_fps_kdline_sampling(centered, count, height, start)
+    x, y, z = np.ascontiguousarray(centered.T)
+    distances, picked = np.full(len(places), np.inf, np.float32), np.empty(count, np.int64)
+    for k in range(count):
+        picked[k] = start
+        squares = np.square(x - x[start]) + np.square(y - y[start]) + np.square(z - z[start])
+        np.minimum(distances, squares, out=distances)
+        start = int(distances.argmax())
     first = np.unique(centered[picked], axis=0, return_index=True)[1]
-    distinct: np.ndarray = picked[np.sort(first)].astype(np.int64)
+    distinct: np.ndarray = picked[np.sort(first)]
     return distinct
 
 

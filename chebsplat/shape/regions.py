@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import fpsample
 import numpy as np
 from scipy.spatial import cKDTree
 
 from chebsplat.settings import DescribeSection
+from chebsplat.shape.regions_kernel import pick_farthest
 
 SAMPLE = 65536  # points that stand for all in estimates of density
 
@@ -60,21 +60,16 @@ def regions_of(means: np.ndarray, settings: DescribeSection) -> Regions:
 def farthest_points(means: np.ndarray, count: int, start: int) -> tuple[np.ndarray, float]:
     """Indices [M] of points, each the farthest from those before it, and their covering radius.
 
-    Choices: M < count where only coincident points are left. Exact in float32 around the centroid.
-      `start` is an index in the library's own order of the points: it seeds the first pick without
-      naming it.
+    Choices: the first is `start`; M < count where only coincident points are left. Exact in float32
+      around the centroid.
     """
     n = len(means)
-    if n == 1:
-        return np.zeros(1, np.int64), 0.0
     points = means - means.mean(0, dtype=np.float64)
     extent = float(np.abs(points).max())
     points = np.ascontiguousarray(points / (extent or 1.0), np.float32)
-    height = int(np.clip(np.log2(n) - 4, 1, 9))
     n_picks = min(count + 1, n)  # one more: its distance is the covering radius
-    picked = np.asarray(
-        fpsample.bucket_fps_kdline_sampling(points, n_picks, height, start), np.int64
-    )
+    order = _tree(points).indices
+    picked = order[pick_farthest(points[order], n_picks, int(np.flatnonzero(order == start)[0]))]
     _, first = np.unique(points[picked], axis=0, return_index=True)
     picked = picked[np.sort(first)]
     centers = picked[:count]

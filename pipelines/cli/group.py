@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 
 import click
 import numpy as np
+from click.shell_completion import CompletionItem
 
 from chebsplat.errors import ConfigError
 from chebsplat.pipelines.work import store
@@ -87,6 +88,28 @@ class NewPath(click.ParamType):
         return path
 
 
+class Known(click.ParamType):
+    """Text that a shell completes by names, or as a path where none fits.
+
+    kinds: of `pipelines.work.scenes.names`, or `finished`: of scenes in the work folder.
+    """
+
+    name = "text"
+
+    def __init__(self, *kinds: str):
+        self.kinds = kinds
+
+    def shell_complete(
+        self, context: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        from chebsplat.pipelines.work import finished, scenes
+
+        lists = [finished.titles() if k == "finished" else scenes.names(k) for k in self.kinds]
+        items = [CompletionItem(name) for some in lists for name in some]
+        fitting = [item for item in items if item.value.startswith(incomplete)]
+        return fitting or [CompletionItem(incomplete, type="file")]
+
+
 class Upward(click.ParamType):
     """x, y or z with a sign, or three numbers, as a unit vector [3]; `auto` as it is."""
 
@@ -127,6 +150,7 @@ VERBOSELY = click.Option(
     callback=be_verbose,
     help="Say what a scene leaves out, and other details.",
 )
+SCENE = click.argument("scene", type=Known("finished"))
 UP = click.option(
     "--up",
     type=Upward(),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from chebsplat.pipelines.cli.group import NewPath
+from chebsplat.pipelines.cli.group import Known, NewPath
 from chebsplat.pipelines.work.heads import ROOMS
 
 NAME = click.option(
@@ -120,7 +120,7 @@ def teach(teacher: Path | None, settings: str, out: Path | None, cores: int) -> 
 
 
 @click.command("teach")
-@click.argument("scene")
+@click.argument("scene", type=Known("scenes"))
 @click.option(
     "--points",
     type=click.Path(path_type=Path),

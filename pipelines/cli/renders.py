@@ -13,7 +13,7 @@ import click
 
 from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.splats import is_splat
-from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath
+from chebsplat.pipelines.cli.group import AGAINST, SCENE, UP, NewPath
 
 VIDEO = ".mp4"
 PATHS = "flight (along the capture's cameras, smoothed and level; of a splat alone within it), \
@@ -57,7 +57,7 @@ class FramesPath(click.ParamType):
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option(
     "--path",
     default="auto",
@@ -113,31 +113,46 @@ def render(
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option("--path", default="capture", show_default=True, help=PATHS)
 @FRAMES
 @UP
 @SIZE
 @click.option(
+    "--full", is_flag=True, help="all that others train on: undistorted photos and points, too"
+)
+@click.option(
     "--out", type=click.Path(path_type=Path), required=True, help="the folder to write into"
 )
 def cameras(
-    scene: str, path: str, frames: int | None, up: Any, size: str | None, out: Path
+    scene: str, path: str, frames: int | None, up: Any, size: str | None, full: bool, out: Path
 ) -> None:
-    """Write a SCENE's cameras as COLMAP's text model, transforms.json and 3DGS' cameras.json."""
+    """Write a SCENE's cameras as COLMAP's model, transforms.json and 3DGS' cameras.json."""
+    from chebsplat.formats.capture import Capture
+    from chebsplat.formats.points import Points
     from chebsplat.pipelines.api import load
-    from chebsplat.stages.tools.camera_files import write_cameras
+    from chebsplat.pipelines.work.finished import artifact_of, scene_folder
+    from chebsplat.stages.tools.camera_files import write_cameras, write_capture
     from chebsplat.stages.tools.camera_paths import fitted, path_of, size_of
 
-    pixels = size_of(size)
-    for file in write_cameras(
-        out, [fitted(camera, pixels) for camera in path_of(load(scene), path, frames, up)]
-    ):
-        print(file.absolute())
+    if full and (path, frames, up, size) != ("capture", None, None, None):
+        raise ConfigError(
+            "--full writes the views as they were captured; leave out --path, --frames, --up, "
+            "--size"
+        )
+    if full:
+        of = str(scene_folder(scene))
+        read = Capture.read(artifact_of(of, "ingest")), Points.read(artifact_of(of, "sfm"))
+        made = write_capture(out, *read)
+    else:
+        pixels = size_of(size)
+        found = path_of(load(scene), path, frames, up)
+        made = write_cameras(out, [fitted(camera, pixels) for camera in found])
+    print(*(path.absolute() for path in made), sep="\n")
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option("--out", type=NewPath(), required=True, help="the .html to write")
 @SH
 @WORDS
@@ -149,7 +164,7 @@ def page(scene: str, out: Path, sh: int, words: Path | None, against: list[str],
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @SH
 @WORDS
 @AGAINST

@@ -10,18 +10,26 @@ from typing import Any
 
 import click
 
+from chebsplat.pipelines.cli.group import Known
 from chebsplat.stages.runtime.device import DEVICES
 
 OPTIONS = [
-    click.option("--scene", help="a name from `chebsplat scenes`, a folder, or a video"),
-    click.option("--sequence", help="scenes in order, each with the lessons of those before it"),
+    click.option(
+        "--scene", type=Known("scenes"), help="a name from `chebsplat scenes`, a folder, or a video"
+    ),
+    click.option(
+        "--sequence",
+        type=Known("sequences"),
+        help="scenes in order, each with the lessons of those before it",
+    ),
     click.option("--set", "settings", default="", help="section.key=value,..."),
     click.option(
         "--quality",
+        type=Known("qualities"),
         default="",
         help="of photos: draft (640 pixels, as by default), standard (1000), high (1600)",
     ),
-    click.option("--ablation", default="", help="a named set of settings"),
+    click.option("--ablation", type=Known("ablations"), default="", help="a named set of settings"),
     click.option(
         "--knowledge",
         default="",
@@ -97,7 +105,7 @@ def plan(device: str, **choice: Any) -> None:
 
 
 @click.command()
-@click.argument("name")
+@click.argument("name", type=Known("studies"))
 @click.option(
     "--cores",
     type=click.IntRange(1),

@@ -10,7 +10,9 @@ from typing import Any
 import click
 
 from chebsplat.errors import ChebsplatError
+from chebsplat.pipelines.cli.group import Known
 
+SCENES = click.argument("scenes", nargs=-1, required=True, type=Known("finished"))
 UNITS = {"m": 60, "h": 3600, "d": 86400, "w": 604800}
 
 
@@ -44,7 +46,7 @@ def list_scenes() -> None:
 
 
 @click.command()
-@click.argument("scenes", nargs=-1, required=True)
+@SCENES
 @click.option("--yes", is_flag=True, help="remove what is listed")
 def rm(scenes: tuple[str, ...], yes: bool) -> None:
     """Remove SCENES: their links and pages, and the artifacts that nothing else names."""
@@ -82,7 +84,7 @@ def show_sizes(sizes: list, removed: bool, advice: str) -> None:
 
 
 @click.command()
-@click.argument("scenes", nargs=-1, required=True)
+@SCENES
 def verify(scenes: tuple[str, ...]) -> int:
     """Recompute every digest of SCENES' artifacts, or of artifacts."""
     from chebsplat.formats.artifact import verify as check

@@ -11,7 +11,7 @@ import click
 
 from chebsplat.errors import ConfigError
 from chebsplat.formats.splats import WRITTEN
-from chebsplat.pipelines.cli.group import AGAINST, UP, NewPath, Phrases, Upward
+from chebsplat.pipelines.cli.group import AGAINST, SCENE, UP, NewPath, Phrases, Upward
 
 
 def report(figures: Mapping[str, Any], out: Path) -> None:
@@ -21,7 +21,7 @@ def report(figures: Mapping[str, Any], out: Path) -> None:
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.argument("text")
 @AGAINST
 @click.option(
@@ -94,7 +94,7 @@ def get_teacher(
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option("--out", type=NewPath(*WRITTEN), required=True, help="the .ply, .spz, .sog or .glb")
 @click.option(
     "--keep-label", "labels", multiple=True, help="a name of labels.json; may be given again"
@@ -125,7 +125,7 @@ def extract(
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option(
     "--as",
     "kind",
@@ -261,7 +261,7 @@ def label(
 
 
 @click.command()
-@click.argument("scene")
+@SCENE
 @click.option(
     "--out", type=NewPath(".ply", ".glb"), required=True, help="the .ply or .glb to write"
 )

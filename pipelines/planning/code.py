@@ -53,23 +53,27 @@ class Code:
         self.package, self.memo = package, memo
         self.read_now = 0  # files parsed in this process
         self._versions: dict[str, str | None] = {}
-        self._stages: dict[str, dict[str, Any]] = {}
+        self._stages: dict[tuple[str, ...], dict[str, Any]] = {}
 
-    def stage(self, name: str, used: tuple[str, ...] = ()) -> dict[str, Any]:
+    def stage(
+        self, name: str, used: tuple[str, ...] = (), chosen: tuple[str, ...] = ()
+    ) -> dict[str, Any]:
         """{"hash": ..., "packages": {name: version}} of stage `name`; computed once by this object.
 
         Args: used: packages of extras that the configuration uses; others of OPTIONAL are no part
-          of the identity.
+          of the identity. chosen: modules of ours that the configuration chooses, which no import
+          names.
         """
-        if name not in self._stages:
-            self._stages[name] = self._identity(name)
-        identity = self._stages[name]
+        modules = (f"chebsplat.stages.{name}", *chosen)
+        if modules not in self._stages:
+            self._stages[modules] = self._identity(modules)
+        identity = self._stages[modules]
         return identity | {"packages": identity["packages"] | self._versions_of(used)}
 
-    def _identity(self, name: str) -> dict[str, Any]:
+    def _identity(self, modules: tuple[str, ...]) -> dict[str, Any]:
         digests: dict[str, str] = {}
         packages: set[str] = set()
-        queue = [f"chebsplat.stages.{name}"]
+        queue = list(modules)
         while queue:
             module = queue.pop()
             path = self._path(module)

@@ -4,7 +4,7 @@ seconds of scenes that this machine has finished.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +32,7 @@ LARGEST = 0.31  # megapixels that a training step sees, at most: finer photos ar
 KNOWN = 20.0  # s by which the default seconds of a stage are believed beside measured ones
 PARALLEL = 0.7  # of the work of a stage: what more cores shorten
 BEGIN = 2.5  # s until a process of a stage has begun
+ON_GPU = 0.3  # of the CPU's seconds, for a stage that computes on a GPU: an H200's training
 N_FINISHED = 8  # scenes whose seconds count, the newest
 
 
@@ -69,47 +70,6 @@ class SceneFacts:
         colour = 0.010 + 0.075 * min(self.trained / self.photos, LARGEST)
         colour *= 0.5 + 0.5 * self.gaussians / 40_000
         return colour * (8 if self.printed else 1.2 if self.semantic else 1)
-
-
-# s of a stage on two idle cores of an AMD EPYC: fitted to generated rooms, fox, redkitchen,
-# house_kitchen and seven captures of photos at 640 to 1600 pixels, within a factor of 1.5 for most
-SECONDS: dict[str, Callable[[SceneFacts], float]] = {
-    "pose": lambda k: 2 + 0.06 * k.raw + 0.6 * k.posed + (0.3 * k.photos + 0.04 * k.pairs) * k.rich,
-    "ingest": lambda k: (
-        0.5 + 2.4 * k.trained if k.kind == "generated" else 0.5 + 0.03 * k.raw + 0.4 * k.trained
-    ),
-    # transforms bring no points, and poses that a depth camera tracks are adjusted
-    "sfm": lambda k: 0.5 + {"transforms": 1.0, "seven_scenes": 2.6}.get(k.kind, 0.3) * k.trained,
-    "channels": lambda k: 0.1,
-    "teacher": lambda k: 1.5 + 0.45 * k.trained if k.model else 0.5 + 0.1 * k.trained,
-    "agree": lambda k: 0.6,
-    "describe": lambda k: 3.0,
-    "encode": lambda k: 1.6,
-    "learn": lambda k: 0.8,
-    "recall": lambda k: 0.5,
-    "onnx": lambda k: 0.6,
-    "train": lambda k: k.clock or 3 + k.step * k.steps,
-    "lift": lambda k: 0.7 + 0.02 * k.trained,
-    "refine": lambda k: 1.0,
-    "export": lambda k: 0.1,
-    "evaluate": lambda k: 1 + 0.2 * k.trained,
-    "report": lambda k: 0.8,
-}
-MEGABYTES: dict[str, Callable[[SceneFacts], float]] = {
-    "pose": lambda k: 0.5,
-    "ingest": lambda k: 2.7 * k.trained,
-    "sfm": lambda k: 2.3,
-    "teacher": lambda k: 3 * k.trained if k.model else k.trained,
-    "describe": lambda k: 19,
-    "encode": lambda k: 24,
-    "train": lambda k: (14 if k.semantic else 8) * k.gaussians / 40_000,
-    "lift": lambda k: 10 * k.gaussians / 40_000,
-    "refine": lambda k: 4 * k.gaussians / 40_000,
-    "export": lambda k: 18 * k.gaussians / 40_000,
-    "evaluate": lambda k: 0.5 * k.trained,
-    "report": lambda k: 2,
-}
-ON_GPU = 0.3  # of the CPU's seconds, for a stage that computes on a GPU: an H200's training
 
 
 @dataclass(frozen=True)
@@ -185,7 +145,7 @@ def photos_of(source: dict[str, Any], sections: dict[str, Any]) -> tuple[int, in
 
 
 def rates(cores: int, device: str) -> dict[str, float]:
-    """By stage, how many times SECONDS a run on so many cores takes.
+    """By stage, how many times its `seconds` a run on so many cores takes.
 
     Choices: more cores than two shorten PARALLEL of the work, and a GPU takes ON_GPU of what it
       computes. The newest scenes that this machine has finished correct that, by the sum of their
@@ -193,8 +153,8 @@ def rates(cores: int, device: str) -> dict[str, float]:
       of seconds say little of those of minutes.
     """
     base, by_cores = store.work(), 1 - PARALLEL + PARALLEL * 2 / cores
-    defaults = {s: by_cores * (ON_GPU if device_of(s, device) == "cuda" else 1) for s in SECONDS}
-    spent, awaited = dict.fromkeys(SECONDS, KNOWN), dict.fromkeys(SECONDS, KNOWN)
+    defaults = {s: by_cores * (ON_GPU if device_of(s, device) == "cuda" else 1) for s in STAGES}
+    spent, awaited = dict.fromkeys(STAGES, KNOWN), dict.fromkeys(STAGES, KNOWN)
     newest = sorted(finished.titles(), key=lambda title: -(base / title).stat().st_mtime)
     for title in newest[:N_FINISHED]:
         manifests = {}
@@ -206,11 +166,11 @@ def rates(cores: int, device: str) -> dict[str, float]:
             of = facts_of({stage: made.config for stage, made in manifests.items()}, semantic)
         except KeyError:  # of a study, or made by another version, with other settings
             continue
-        for stage in manifests.keys() & SECONDS:
+        for stage in manifests.keys() & STAGES:
             if of is not None and is_alike(manifests[stage], cores, device):
                 spent[stage] += idle_seconds(manifests[stage])
-                awaited[stage] += defaults[stage] * SECONDS[stage](of)
-    return {stage: defaults[stage] * spent[stage] / awaited[stage] for stage in SECONDS}
+                awaited[stage] += defaults[stage] * STAGES[stage].seconds(of)
+    return {stage: defaults[stage] * spent[stage] / awaited[stage] for stage in STAGES}
 
 
 def is_alike(manifest: Manifest, cores: int, device: str) -> bool:
@@ -247,13 +207,13 @@ def forecast(plan: Plan, steps: Iterable[Step], cores: int, device: str) -> Fore
     factors = rates(cores, device)
 
     def seconds(of: SceneFacts) -> dict[str, float]:
-        return {stage: SECONDS[stage](of) * factors[stage] for stage in stages}
+        return {stage: STAGES[stage].seconds(of) * factors[stage] for stage in stages}
 
     expected, saved = seconds(now), 0.0
     # of photos that are read already, fewer would be read anew
     if "ingest" in stages and now.photos > MANY and (fewer := facts_of(sections, semantic, MANY)):
         saved = sum(expected.values()) - sum(seconds(fewer).values())
-    size = sum(MEGABYTES[stage](now) for stage in stages if stage in MEGABYTES)
+    size = sum(STAGES[stage].megabytes(now) for stage in stages)
     return Forecast(now.photos, expected, size, saved)
 
 

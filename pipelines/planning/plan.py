@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from chebsplat.errors import ConfigError
+from chebsplat.evaluation import protocols
 from chebsplat.formats.names import unprintable
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
 from chebsplat.pipelines.planning.code import PACKAGE, PLACES, Code, step_key
@@ -285,6 +286,9 @@ class Planner:
                     store_inputs["knowledge"] = inputs["start"]
                     left_out["recall"] = "no lesson to add to what ships"
                     continue
+            if lacking := [of for role, of in stage.inputs if role not in inputs]:
+                left_out[stage.name] = f"{lacking[0]} is left out"
+                continue
             keys = {role: path.name for role, path in inputs.items()}
             without = stage.name == "train" and "features" not in inputs
             step = steps[stage.name] = self.step(
@@ -354,7 +358,8 @@ class Planner:
         raw = hashes(files, self.file_memo.values)
         device = stage.device(self.device, sections)
         computing = stage.device_packages if device == "cuda" else ()
-        code = self.code.stage(stage.name, (*used, *computing, *media_packages(files)))
+        chosen = (protocols.module_of(config.ingest.protocol),) if stage.of_protocol else ()
+        code = self.code.stage(stage.name, (*used, *computing, *media_packages(files)), chosen)
         content = content_hash(raw, root) if raw or stage.name in ("pose", "ingest") else None
         key = step_key(stage, sections, keys, code, content, device)
         return Step(

@@ -12,7 +12,6 @@ import subprocess
 import threading
 import time
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,45 +23,12 @@ from chebsplat.formats.extras import require
 from chebsplat.pipelines.work import leases, store
 from chebsplat.pipelines.work.store import say
 from chebsplat.settings import MOST_STEPS
-from chebsplat.stages.registry import MODEL_FREE
+from chebsplat.stages.registry import MODEL_FREE, STAGES
 from chebsplat.stages.runtime.stopping import end_itself
 
 HERE = Path(__file__).parents[1]
 LOCAL, SLURM = "local", "slurm"
 PLUGIN = "snakemake_executor_plugin_slurm"
-
-
-@dataclass(frozen=True)
-class Need:
-    """Resources that a stage requests of a cluster."""
-
-    minutes: int
-    mem_mb: int  # doubled at each retry
-
-
-# Ten times the longest measured time and three times the memory: a job that requests too little is
-# lost, one that requests too much starts a little later.
-# Measured in 18 scenes on two EPYC cores: seconds (median, max); peak memory in office0.
-NEEDS = {
-    "pose": Need(100, 4000),
-    "ingest": Need(10, 2000),  # 21, 49; 306 MB
-    "channels": Need(10, 2000),  # 18, 48
-    "sfm": Need(100, 4000),  # 5 with depth; 295 MB
-    "teacher": Need(15, 4000),  # 9, 66; 1088 MB
-    "agree": Need(5, 2000),  # 1, 3; 121 MB
-    "teach": Need(600, 8000),  # 3142
-    "describe": Need(5, 4000),
-    "encode": Need(5, 4000),
-    "learn": Need(5, 4000),
-    "recall": Need(5, 4000),
-    "onnx": Need(5, 4000),
-    "train": Need(15, 4000),  # plus the time of its steps: 80, 239 for 3000; 693 MB
-    "lift": Need(5, 2000),  # 5, 12; 571 MB
-    "refine": Need(5, 4000),  # 9, 22; 1083 MB
-    "export": Need(5, 2000),  # 1, 2; 138 MB
-    "evaluate": Need(5, 2000),  # 5, 27; 646 MB
-    "report": Need(5, 2000),  # 2, 7; 144 MB
-}
 BESIDE = {  # a step joins the job that makes the first of these inputs
     "describe": ("points", "capture"),
     "encode": ("descriptors",),
@@ -153,7 +119,7 @@ def jobs_of(entries: list[dict[str, Any]], on: str) -> dict[str, dict[str, Any]]
             "keys": [entry["key"] for entry in some],
             "threads": max(entry["threads"] for entry in some),
             "minutes": sum(map(minutes_of, some)),
-            "mem_mb": max(NEEDS[entry["stage"]].mem_mb for entry in some),
+            "mem_mb": max(STAGES[entry["stage"]].mem_mb for entry in some),
             "gpus": int(any(entry["device"] == "cuda" for entry in some)),
             "elsewhere": on != LOCAL,
         }
@@ -209,7 +175,7 @@ def seconds_of(train: dict[str, Any]) -> float:
 def minutes_of(entry: dict[str, Any]) -> int:
     """Minutes that a step requests."""
     more = 10 * seconds_of(entry) / 60 if entry["stage"] == "train" else 0
-    return NEEDS[entry["stage"]].minutes + round(more)
+    return STAGES[entry["stage"]].minutes + round(more)
 
 
 def job_prefix(plan: Path) -> str:

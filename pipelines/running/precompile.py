@@ -102,6 +102,13 @@ def losses() -> None:
     feature_distance(features, torch.rand(HEIGHT // 4, WIDTH // 4, CHANNELS)).backward()
 
 
+def regions() -> None:
+    """Centres of regions."""
+    from chebsplat.shape.regions import farthest_points
+
+    farthest_points(np.eye(3), 2, 0)
+
+
 def lifting() -> None:
     """A lift of features, before and after a training."""
     from chebsplat.lifting.observations import estimate, gathered
@@ -139,10 +146,10 @@ def descriptors() -> None:
     point_inputs(means, np.tile([0.0, 0, 1], (4 * N, 1)), shapes, up=np.array([0, 0, 1.0]))
 
 
-NEEDED = (colors, losses, adjoints, rasterizer)  # by any training
+NEEDED = (colors, losses, regions, adjoints, rasterizer)  # by any training
 SEMANTIC = (lifting, descriptors)  # by one with features
 # a lift contains the kernels of an image
-SIDE_BY_SIDE = (rasterizer, lifting), (adjoints,), (losses, colors)
+SIDE_BY_SIDE = (rasterizer, lifting), (adjoints,), (losses, colors, regions)
 
 
 @contextmanager

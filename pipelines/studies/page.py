@@ -109,7 +109,7 @@ def note(study: Study, rows: list[Row]) -> str:
         else ("Student's over the seeds of the one scene")
     )
     first = ""
-    if any(hasattr(protocols.ALL[row["protocol"]], "over_scenes") for row in rows):
+    if any(hasattr(protocols.load(row["protocol"]), "over_scenes") for row in rows):
         first = " mIoU, mAcc and OA are of all scenes of a seed together, as the protocol has it."
     return (
         "Mean ± standard deviation over scenes and seeds, on the views of the protocol. Below "

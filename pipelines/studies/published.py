@@ -55,14 +55,14 @@ def _cells(paper: dict[str, float], line: Line | None, figure: Figure) -> list[s
 def _note(study: Study, condition: str, finished: list[Row]) -> str:
     """The protocol of a table as configured, and the resolution and split of its finished runs."""
     ingest = build(study.conditions[condition], condition).ingest
-    rule = protocols.ALL[ingest.protocol]
-    split = f"view index % {rule.TEST_EVERY} == {rule.TEST_OFFSET} is test"
-    if rule.ON_TRAINING:
+    rule = protocols.load(ingest.protocol).RULE
+    split = f"view index % {rule.test_every} == {rule.test_offset} is test"
+    if rule.on_training:
         split = "no view is held out"
-    elif rule.OWN_SPLIT:
+    elif rule.own_split:
         split += " unless the source says"
     views = f", {ingest.max_views} views a scene" if ingest.max_views else ""
-    text = f"Protocol {rule.NAME}: {split}, {ingest.max_side} pixels at most{views}; scenes "
+    text = f"Protocol {ingest.protocol}: {split}, {ingest.max_side} pixels at most{views}; scenes "
     text += f"{', '.join(study.tables[condition].scenes)}."
     used = sorted({f"{row['resolution']} ({row['split']})" for row in finished})
     return text + (f" Measured at {'; '.join(used)}." if used else "")

@@ -167,7 +167,7 @@ def over_scenes(rows: list[Row]) -> list[Row]:
     Args: rows: finished ones of one protocol. The rows themselves, where it has no rule for several
       scenes.
     """
-    rule = getattr(protocols.ALL[rows[0]["protocol"]], "over_scenes", None) if rows else None
+    rule = getattr(protocols.load(rows[0]["protocol"]), "over_scenes", None) if rows else None
     if rule is None:
         return rows
     pooled = []

@@ -192,7 +192,7 @@ def _versions() -> dict[str, str]:
     """Versions of the packages that the stage really loaded."""
     names = (
         "torch", "numpy", "scipy", "numba", "llvmlite", "pycolmap", "open3d", "zarr", "onnx",
-        "onnxruntime", "fpsample", "PIL", "safetensors", "plyfile", "matplotlib", "av",
+        "onnxruntime", "PIL", "safetensors", "plyfile", "matplotlib", "av",
         "pillow_heif", "gsplat",
     )  # fmt: skip
     distributions = {"open3d": "open3d-cpu", "PIL": "pillow"}

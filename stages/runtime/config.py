@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from chebsplat.errors import ChebsplatError, ConfigError
 from chebsplat.formats.files import parse_json, parse_toml
@@ -32,7 +32,8 @@ WORDS = {  # pydantic's kinds of error, in a user's words
 class Config(Section):
     scene: parts.SceneSection = parts.SceneSection()
     source: parts.SourceSection = parts.SourceSection()
-    ingest: parts.IngestSection = parts.IngestSection()
+    # made when a config is: its default reads a protocol
+    ingest: parts.IngestSection = Field(default_factory=parts.IngestSection)
     pose: parts.PoseSection = parts.PoseSection()
     sfm: parts.SfmSection = parts.SfmSection()
     channels: parts.ChannelsSection = parts.ChannelsSection()

@@ -1,4 +1,4 @@
-"""Cameras in other programs' files: COLMAP's text model, transforms.json, 3DGS' cameras.json.
+"""Cameras in other programs' files: COLMAP's model, transforms.json, 3DGS' cameras.json.
 
 World, units and pixel centres (half integers) are those of the scene; axes are those of each
 format. Images are named by the view with .png.
@@ -6,18 +6,25 @@ format. Images are named by the view with .png.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import pycolmap
 
 from chebsplat.errors import ConfigError, InputError
-from chebsplat.formats.files import atomic_write, parse_json
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.files import atomic_path, atomic_write, explained, parse_json
+from chebsplat.formats.points import Points
+from chebsplat.formats.world import World
+from chebsplat.stages.pages.pictures import png
 from chebsplat.stages.sources.cameras import cam_from_world, camera_of
 from chebsplat.stages.sources.common import stem
 from chebsplat.stages.sources.texts import number
@@ -25,53 +32,120 @@ from chebsplat.stages.sources.transforms import OPENGL
 from chebsplat.stages.tools.scene import Camera
 
 AGAIN = "write it again"
+IMAGES, MASKS = "images/{}.png", "masks/{}.png.png"  # as COLMAP's --mask_path finds these
 
 
-def write_cameras(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
-    """Write cameras as sparse/0 (COLMAP), transforms.json and cameras.json; returns the files.
+def write_cameras(
+    folder: Path,
+    cameras: Sequence[Camera],
+    cloud: Points | None = None,
+    photos: Mapping[str, Callable[[int], np.ndarray]] | None = None,
+) -> list[Path]:
+    """Write cameras as sparse/0 (COLMAP), transforms.json and cameras.json; returns their paths.
 
-    Raises: ConfigError if one of them exists.
+    Args: cloud: points of the model, in the world of the cameras; photos: functions of a camera's
+      index to its image u8, by the format of the image's name.
+    Raises: ConfigError if something is there already.
     """
-    contents = colmap_texts(cameras) | {
-        "transforms.json": json.dumps(transforms(cameras), indent=1),
-        "cameras.json": json.dumps(gs_cameras(cameras), indent=1),
+    model, photos = folder / "sparse/0", photos or {}
+    texts = {
+        folder / "transforms.json": transforms(cameras, MASKS in photos),
+        folder / "cameras.json": gs_cameras(cameras),
     }
-    paths = {folder / name: text for name, text in contents.items()}
-    for path in paths:
+    stacks = {folder / form: of for form, of in photos.items()}
+    made = [model, *texts, *(path.parent for path in stacks)]
+    for path in made:
         if path.exists():
             raise ConfigError(f"{path} exists; remove it, or choose another --out")
-    for path, text in paths.items():
-        atomic_write(path, text)
-    return list(paths)
+    for path, of in stacks.items():
+        for k, camera in enumerate(cameras):
+            with atomic_path(path.parent / path.name.format(camera.name)) as temporary:
+                png(of(k), temporary)
+    with explained(folder):
+        model.mkdir(parents=True)
+        colmap_model(cameras, cloud).write_binary(model)
+    for path, document in texts.items():
+        atomic_write(path, json.dumps(document, indent=1))
+    return made
 
 
-def colmap_texts(cameras: Sequence[Camera]) -> dict[str, str]:
-    """COLMAP's text model by file: a PINHOLE camera for each lens and size, no points."""
-    lenses: dict[tuple[float, ...], int] = {}
-    images = [
-        "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then keypoints, of which there are none"
+def write_capture(folder: Path, capture: Capture, points: Points) -> list[Path]:
+    """Write a scene's registered views for other programs to train on: its cameras, undistorted
+    photos, points and, where pixels do not count, masks. Returns, raises: as `write_cameras`.
+    """
+    world = World.read(capture.source)
+    poses = world.poses_outward(points.cam_from_world)
+    names = file_names([f"{name}.png" for name in points.names])
+    cameras = [
+        Camera(name, K, pose, *capture.size)
+        for name, K, pose in zip(names, points.Ks, poses, strict=True)
     ]
-    for index, camera in enumerate(cameras, start=1):
-        lens = lenses.setdefault(
-            (camera.width, camera.height, *map(float, intrinsics(camera))), len(lenses) + 1
+    rows, mask = [capture.names.index(name) for name in points.names], capture.loss_mask
+    photos = {IMAGES: lambda k: capture.images[rows[k]]}
+    if mask is not None:
+        photos[MASKS] = lambda k: np.uint8(255) * mask[rows[k]]
+    return write_cameras(
+        folder, cameras, replace(points, means=world.outward(points.means)), photos
+    )
+
+
+def file_names(views: list[str]) -> list[str]:
+    """A file name for each view: its path without separators, numbered where two coincide."""
+    names: list[str] = []
+    for view in views:
+        name = re.sub(r"[^\w.-]+", "-", view.removesuffix(Path(view).suffix)).strip(".-") or "view"
+        name = name.encode()[:200].decode(errors="ignore")
+        used_names = {used.lower() for used in names}  # some file systems fold case
+        names.append(
+            next(
+                new
+                for k in itertools.count(1)
+                if (new := name if k == 1 else f"{name}-{k}").lower() not in used_names
+            )
         )
-        pose = [*quaternion(camera.cam_from_world[:3, :3]), *camera.cam_from_world[:3, 3]]
-        images += [f"{index} {' '.join(repr(float(v)) for v in pose)} {lens} {camera.name}.png", ""]
-    rows = [f"{key} PINHOLE {' '.join(map(repr, lens))}" for lens, key in lenses.items()]
-    return {
-        "sparse/0/cameras.txt": "\n".join(
-            ["# CAMERA_ID MODEL WIDTH HEIGHT FX FY CX CY", *rows, ""]
-        ),
-        "sparse/0/images.txt": "\n".join([*images, ""]),
-        "sparse/0/points3D.txt": "# no points\n",
-    }
+    return names
 
 
-def transforms(cameras: Sequence[Camera]) -> dict[str, Any]:
-    """nerfstudio's document: camera-to-world in OpenGL's axes, intrinsics by frame."""
+def colmap_model(cameras: Sequence[Camera], cloud: Points | None) -> pycolmap.Reconstruction:
+    """COLMAP's model: a PINHOLE camera for each lens and size, the points and their tracks.
+
+    Choices: binary, as in its text a name ends at a space. A keypoint is where its point projects
+      to: what was measured there is not kept.
+    """
+    model, lenses = pycolmap.Reconstruction(), dict[tuple[float, ...], int]()
+    tracks: list[list[pycolmap.TrackElement]] = [[] for _ in (() if cloud is None else cloud.means)]
+    for index, camera in enumerate(cameras):
+        lens = (camera.width, camera.height, *map(float, intrinsics(camera)))
+        key = lenses.setdefault(lens, len(lenses) + 1)
+        if not model.exists_camera(key):
+            model.add_camera_with_trivial_rig(
+                pycolmap.Camera(
+                    model="PINHOLE", width=lens[0], height=lens[1], params=lens[2:], camera_id=key
+                )
+            )
+        image = pycolmap.Image(name=f"{camera.name}.png", camera_id=key, image_id=index + 1)
+        if cloud is not None:
+            seen = np.unique(cloud.tracks[cloud.tracks[:, 1] == index, 0])
+            pose = camera.cam_from_world
+            rays = (cloud.means[seen] @ pose[:3, :3].T + pose[:3, 3]) @ camera.K.T
+            image.points2D = pycolmap.Point2DList(
+                [pycolmap.Point2D(xy) for xy in rays[:, :2] / rays[:, 2:]]
+            )
+            for place, row in enumerate(seen):
+                tracks[row].append(pycolmap.TrackElement(index + 1, place))
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.cam_from_world[:3]))
+    if cloud is not None:
+        for position, color, track in zip(cloud.means, cloud.colors, tracks, strict=True):
+            model.add_point3D(position, pycolmap.Track(track), color)
+    return model
+
+
+def transforms(cameras: Sequence[Camera], masked: bool) -> dict[str, Any]:
+    """nerfstudio's document: camera-to-world in OpenGL's axes, intrinsics by frame; with masks."""
     keys = ("fl_x", "fl_y", "cx", "cy")
     frames = [
-        {"file_path": f"images/{camera.name}.png", "w": camera.width, "h": camera.height}
+        {"file_path": IMAGES.format(camera.name), "w": camera.width, "h": camera.height}
+        | ({"mask_path": MASKS.format(camera.name)} if masked else {})
         | dict(zip(keys, map(float, intrinsics(camera)), strict=True))
         | {"transform_matrix": (np.linalg.inv(camera.cam_from_world) * OPENGL).tolist()}
         for camera in cameras
@@ -178,9 +252,3 @@ def _usable(path: Path) -> Iterator[None]:
 def intrinsics(camera: Camera) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy."""
     return camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of a rotation [3, 3], w not negative."""
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
-    return np.array([w, x, y, z])

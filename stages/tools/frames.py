@@ -5,10 +5,8 @@ A video of them is H.264 in MP4, through PyAV.
 
 from __future__ import annotations
 
-import itertools
 import json
 import logging
-import re
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -24,7 +22,7 @@ from chebsplat.formats.files import atomic_path, atomic_write, parse_json
 from chebsplat.formats.images import opened, read_rgb
 from chebsplat.labels.decode import decode_labels
 from chebsplat.stages.runtime.progress import Progress
-from chebsplat.stages.tools.camera_files import gs_cameras
+from chebsplat.stages.tools.camera_files import file_names, gs_cameras
 from chebsplat.stages.tools.query import Query
 from chebsplat.stages.tools.scene import COVERED, Camera, OpenedScene
 
@@ -120,23 +118,6 @@ def warn_of_empty(scene: OpenedScene, cameras: Sequence[Camera]) -> None:
             100 * empty / len(sample),
             100 * EMPTY,
         )
-
-
-def file_names(views: list[str]) -> list[str]:
-    """A file name for each view: its path without separators, numbered where two coincide."""
-    names: list[str] = []
-    for view in views:
-        name = re.sub(r"[^\w.-]+", "-", view.removesuffix(Path(view).suffix)).strip(".-") or "view"
-        name = name.encode()[:200].decode(errors="ignore")
-        used_names = {used.lower() for used in names}  # some file systems fold case
-        names.append(
-            next(
-                new
-                for k in itertools.count(1)
-                if (new := name if k == 1 else f"{name}-{k}").lower() not in used_names
-            )
-        )
-    return names
 
 
 def ending(kind: str) -> str:

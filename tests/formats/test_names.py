@@ -13,8 +13,8 @@ from chebsplat.formats.manifest import Manifest
 from chebsplat.formats.names import check_names, suggest
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.scene import Scene
+from chebsplat.stages.tools.camera_files import file_names
 from chebsplat.stages.tools.extract import extract
-from chebsplat.stages.tools.frames import file_names
 from chebsplat.stages.tools.scene import OpenedScene
 
 LABELS = ["café", "Tür", "沙发", "two\nlines", "🛋️", "back\\slash"]

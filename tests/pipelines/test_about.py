@@ -2,6 +2,7 @@
 so.
 """
 
+import os
 import re
 import subprocess
 import sys
@@ -113,6 +114,38 @@ def test_make_says_the_code_that_it_cannot_leave_with():
     )
     assert done.returncode == 2  # GNU make's own, whatever failed
     assert "not a folder" in done.stderr and "Error 3" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("chebsplat quer", "query"),
+        ("chebsplat query of", "office0"),
+        ("chebsplat rm office0 mi", "mine"),
+        ("chebsplat run --scene room", "room0 room1 room2"),
+        ("chebsplat run --scene min", ""),
+        ("chebsplat plan --quality d", "draft"),
+        ("chebsplat study paper", "paper-tables"),
+    ],
+)
+def test_a_shell_completes_commands_and_names_of_scenes(words, found, quick_plans, tmp_path):
+    """As docs/usage.md says; quick_plans: of a work folder of its own."""
+    page = (ROOT / "docs/usage.md").read_text().replace(".venv/bin/", "")
+    line = re.search(r"^    (eval .*bash_source.*?) +#", page, re.MULTILINE)
+    for name in ("office0", "mine"):
+        (quick_plans / name / "ingest").mkdir(parents=True)
+        (quick_plans / name / "ingest/artifact.json").touch()
+    typed = f"COMP_WORDS=({words}); COMP_CWORD={len(words.split()) - 1}"
+    script = f'{line[1]}; {typed}; _chebsplat_completion chebsplat; echo "${{COMPREPLY[@]}}"'
+    command = tmp_path / "bin/chebsplat"  # as pip makes it
+    command.parent.mkdir()
+    command.write_text(f"#!{sys.executable}\nfrom chebsplat.pipelines.cli import main\nmain()\n")
+    command.chmod(0o755)
+    there = {"PATH": f"{command.parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        ["bash", "-c", script], env=os.environ | there, capture_output=True, text=True
+    )
+    assert (done.stdout.strip(), done.returncode) == (found, 0), done.stderr
 
 
 def test_help_lists_every_command_once_by_what_a_user_wants():

@@ -13,7 +13,7 @@ from shared import ROOT, data, photo_folder, remember
 from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines.cli import main
 from chebsplat.pipelines.planning import forecast as forecasts
-from chebsplat.pipelines.planning.forecast import SECONDS, facts_of, forecast, sentence
+from chebsplat.pipelines.planning.forecast import facts_of, forecast, sentence
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.work import store
 from chebsplat.stages.registry import STAGES
@@ -63,10 +63,6 @@ def test_a_forecast_is_within_a_factor_of_one_and_a_half_of_what_was_measured(
     assert 1 / 1.5 < sum(found.seconds.values()) / seconds < 1.5
 
 
-def test_every_stage_of_a_scene_has_a_forecast():
-    assert {name for name, stage in STAGES.items() if stage.of_scene} == SECONDS.keys()
-
-
 @pytest.mark.parametrize(
     ("more", "fewer"),
     [
@@ -83,7 +79,7 @@ def test_more_work_is_expected_to_take_longer(more, fewer):
 
 
 def test_a_training_by_the_clock_takes_what_it_is_given():
-    assert SECONDS["train"](facts_of(sections("office0", "train.seconds=600"), True)) == 600
+    assert STAGES["train"].seconds(facts_of(sections("office0", "train.seconds=600"), True)) == 600
 
 
 @pytest.mark.parametrize(
@@ -147,7 +143,7 @@ def finished(scene, factor, threads=2, load=0.5):
     of = facts_of(sections(scene), True)
     for step in Planner().plan(scene).steps:
         stage = STAGES[step.stage]
-        seconds = factor * SECONDS[step.stage](of)
+        seconds = factor * stage.seconds(of)
         machine = {"processor": processor(), "gpu": "", "cores": 2, "threads": threads}
         processes = [machine | {"load": [load, load], "seconds": seconds}]
         inputs = {role: {"key": path.name, "schema": "s/1"} for role, path in step.inputs.items()}

@@ -1,36 +1,35 @@
 """Evaluation protocols: which views are tested, how labels are compared. One module each, quirks in
-its docstring.
+its docstring; `ingest.protocol` calls it by its name, with hyphens.
 
 A figure measured under one protocol is never put beside one measured under another: the protocol's
-name and parameters go with every figure. Every module has
+name and parameters go with every figure. Every module but `task` has
 
-    NAME         what `ingest.protocol` calls it
-    TEST_EVERY, TEST_OFFSET   a view is a test view if its index among the names, modulo the one, is
-    the other ADJUSTABLE   whether a config may change these two (they are recorded)
-    OWN_SPLIT    whether a source's own split goes first
-    ON_TRAINING  whether the training views are evaluated, and none is held out
-    TRUTH        "labels" of the capture, or "teacher": the teacher's own
-    measure(views, task) -> dict with `classes`, `scene` and what its mIoU rests on
-    (`task.counted`), by name of the
-                 figure; `teacher` where the truth is the capture's
-    over_scenes(scenes) -> dict, where figures of several scenes together are no plain mean of every
-    run's
+    RULE                  which views are tested, and against what (`task.Rule`)
+    measure(views, task)  -> dict with `classes`, `scene`, what each mIoU rests on (`task.counted`)
+                          by the figure's name, and `teacher` where the truth is the capture's
+    over_scenes(scenes)   -> dict, where figures of several scenes together are no plain mean of
+                          every run's
+
+None is imported here: the key of a scene is of its own protocol alone
+(`stages.registry.Stage.of_protocol`).
 """
 
 from __future__ import annotations
 
+from importlib import import_module
+from pkgutil import iter_modules
 from types import ModuleType
 
-from chebsplat.evaluation.protocols import (
-    deep_blending,
-    labels,
-    replica_f3,
-    replica_gt,
-    scannet_closed,
-    scannet_open,
+NAMES = tuple(
+    module.name.replace("_", "-") for module in iter_modules(__path__) if module.name != "task"
 )
 
-ALL: dict[str, ModuleType] = {
-    module.NAME: module
-    for module in (labels, replica_f3, replica_gt, scannet_open, scannet_closed, deep_blending)
-}
+
+def module_of(name: str) -> str:
+    """The dotted name of a protocol's module."""
+    return f"{__name__}.{name.replace('-', '_')}"
+
+
+def load(name: str) -> ModuleType:
+    """The module of a protocol, one of NAMES."""
+    return import_module(module_of(name))

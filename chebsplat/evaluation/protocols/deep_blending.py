@@ -9,15 +9,8 @@ without the semantic branch. Labels, resizing and averaging: see `replica_f3`.
 from __future__ import annotations
 
 from chebsplat.evaluation.protocols.replica_f3 import measure
+from chebsplat.evaluation.protocols.task import Rule
 
-NAME = "deep-blending"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
-    8,
-    0,
-    True,
-    False,
-    False,
-    "teacher",
-)
+RULE = Rule(side=1600, adjustable=True, truth="teacher")
 
 __all__ = ["measure"]

@@ -18,18 +18,17 @@ from typing import Any
 import numpy as np
 
 from chebsplat.evaluation.metrics import IGNORE, boundary_band, confusion, segmentation, thinned
-from chebsplat.evaluation.protocols.task import EvaluatedView, Task, counted, mean_over, predicted
+from chebsplat.evaluation.protocols.task import (
+    EvaluatedView,
+    Rule,
+    Task,
+    counted,
+    mean_over,
+    predicted,
+)
 from chebsplat.labels.decode import decode_labels
 
-NAME = "labels"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
-    8,
-    0,
-    True,
-    True,
-    False,
-    "labels",
-)
+RULE = Rule(adjustable=True, own_split=True)
 
 N_RAREST = 5  # classes whose mean IoU is reported separately
 PER_VIEW = 40_000  # pixels of a view that become points, about, on a regular grid

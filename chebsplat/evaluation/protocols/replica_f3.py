@@ -21,6 +21,7 @@ import numpy as np
 from chebsplat.errors import DataFailure
 from chebsplat.evaluation.protocols.task import (
     EvaluatedView,
+    Rule,
     Task,
     bilinear,
     counted,
@@ -30,15 +31,7 @@ from chebsplat.evaluation.protocols.task import (
 from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import folded
 
-NAME = "replica-f3"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
-    8,
-    2,
-    False,
-    False,
-    False,
-    "teacher",
-)
+RULE = Rule(test_offset=2, truth="teacher")
 N_LABELS, N_COUNTED = 150, 7
 MERGED = {90: 15, 29: 4, 58: 40}  # ids from 1
 SPELT = {4: "floor", 15: "door", 29: "rug", 40: "cushion", 58: "pillow", 90: "television"}

@@ -8,15 +8,8 @@ beside `replica-f3`, whose truth is a teacher.
 from __future__ import annotations
 
 from chebsplat.evaluation.protocols.labels import measure
+from chebsplat.evaluation.protocols.task import Rule
 
-NAME = "replica-gt"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
-    8,
-    2,
-    False,
-    False,
-    False,
-    "labels",
-)
+RULE = Rule(test_offset=2)
 
 __all__ = ["measure"]

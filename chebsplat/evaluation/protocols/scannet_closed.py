@@ -21,6 +21,7 @@ import numpy as np
 from chebsplat.evaluation.metrics import confusion
 from chebsplat.evaluation.protocols.task import (
     EvaluatedView,
+    Rule,
     Task,
     counted,
     mean_over,
@@ -31,14 +32,7 @@ from chebsplat.evaluation.protocols.task import (
 )
 
 NAME = "scannet-closed"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
-    5,
-    0,
-    False,
-    True,
-    False,
-    "labels",
-)
+RULE = Rule(side=592, test_every=5, own_split=True)
 CLASSES = (
     "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "counter",
     "shelves", "curtain", "ceiling", "refrigerator", "television", "person", "toilet", "sink",

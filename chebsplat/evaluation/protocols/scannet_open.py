@@ -20,6 +20,7 @@ import numpy as np
 from chebsplat.evaluation.metrics import confusion
 from chebsplat.evaluation.protocols.task import (
     EvaluatedView,
+    Rule,
     Task,
     counted,
     mean_over,
@@ -31,14 +32,7 @@ from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import joined
 
 NAME = "scannet-open"
-TEST_EVERY, TEST_OFFSET, ADJUSTABLE, OWN_SPLIT, ON_TRAINING, TRUTH = (
-    1,
-    0,
-    False,
-    False,
-    True,
-    "labels",
-)
+RULE = Rule(side=648, test_every=1, on_training=True)
 CLASSES = (
     "wall", "floor", "cabinet", "bed", "chair", "sofa", "table", "door", "window", "shelves",
     "counter", "curtain", "ceiling", "refrigerator", "television", "person", "toilet", "sink",

@@ -1,16 +1,39 @@
-"""Input of a protocol: evaluated views one by one, and the names of their labels and classes."""
+"""What protocols share: the rule of their views; their input, which is evaluated views one by one
+and the names of labels and classes; and ways to compare labels.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from chebsplat.errors import DataFailure
 from chebsplat.evaluation.metrics import IGNORE
 from chebsplat.labels.names import lacking, rows_of
+
+
+@dataclass(frozen=True)
+class Rule:
+    """Which views a protocol tests, and against what.
+
+    side: pixels of a view's longest side, unless `ingest.max_side` says another.
+    test_every, test_offset: a view is a test view if its index among the names, modulo the one, is
+      the other; adjustable: a config may change these two, which are recorded.
+    own_split: a source's own split goes first. on_training: the training views are evaluated, and
+      none is held out.
+    truth: labels of the capture, or the teacher's own.
+    """
+
+    side: int = 640
+    test_every: int = 8
+    test_offset: int = 0
+    adjustable: bool = False
+    own_split: bool = False
+    on_training: bool = False
+    truth: Literal["labels", "teacher"] = "labels"
 
 
 @dataclass

@@ -3,7 +3,6 @@ the right ones.
 """
 
 import itertools
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -22,7 +21,8 @@ from chebsplat.evaluation.protocols import (
 )
 from chebsplat.evaluation.protocols.task import EvaluatedView, MapsByName, Task, bilinear, resized
 from chebsplat.stages.ingest import every, renamed, split, thinned
-from chebsplat.stages.settings import SIDES, IngestSection
+from chebsplat.stages.runtime.config import build
+from chebsplat.stages.settings import IngestSection
 
 ADE = [replica_f3.SPELT.get(k, f"label_{k}") for k in range(1, 151)]
 ADE[0] = "wall"
@@ -63,9 +63,11 @@ def test_each_protocol_has_its_own_test_views(protocol, tests):
     assert record["name"] == protocol and record["split"]
 
 
-def test_a_config_knows_every_protocol_and_no_other():
-    assert set(get_args(IngestSection.model_fields["protocol"].annotation)) == set(protocols.ALL)
-    assert set(SIDES) == set(protocols.ALL)
+@pytest.mark.parametrize("name", ["lables", "task", "replica_f3", ""])
+def test_another_protocol_is_refused_with_the_names_that_there_are(name):
+    with pytest.raises(ConfigError, match=r"^scene a: ingest\.protocol: it must be ") as error:
+        build({"ingest": {"protocol": name}}, "scene a")
+    assert all(f"'{known}'" in str(error.value) for known in protocols.NAMES)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +82,7 @@ def test_only_labels_and_scannet_closed_follow_a_sources_own_split():
     names, own = [str(k) for k in range(20)], np.arange(20) == 7
     followed = {
         name
-        for name in protocols.ALL
+        for name in protocols.NAMES
         if np.array_equal(split(names, own, IngestSection(protocol=name))[0], own)
     }
     assert followed == {"labels", "scannet-closed"}

@@ -13,10 +13,16 @@ def cloud(n=4000, seed=0):
     return np.random.default_rng(seed).random((n, 3)) * [5.0, 4.0, 0.5]
 
 
-def test_centres_are_in_farthest_point_order():
-    points = cloud(500)
+@pytest.mark.parametrize(
+    "points",
+    [cloud(500), cloud(20_000) ** 9, np.indices((9, 9, 9)).reshape(3, -1).T, cloud(129)],
+    ids=["even", "dense in a corner", "of equal distances", "one more than a block"],
+)
+def test_centres_are_in_farthest_point_order(points):
+    points = points.astype(float)
     picked, reach = farthest_points(points, 60, 7)
-    distance = np.full(500, np.inf)
+    assert picked[0] == 7 and len(set(picked)) == 60
+    distance = np.full(len(points), np.inf)
     for before, after in itertools.pairwise(picked):
         distance = np.minimum(distance, np.linalg.norm(points - points[before], axis=1))
         assert distance[after] >= distance.max() * (1 - 1e-6)  # float32 inside

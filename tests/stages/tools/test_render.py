@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 from box_room import room
 from click.testing import CliRunner
@@ -19,10 +20,16 @@ from scipy.spatial.transform import Rotation
 
 import chebsplat
 from chebsplat.errors import ConfigError, InputError
+from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.ply import write_ply
+from chebsplat.formats.points import Points
+from chebsplat.formats.world import World
+from chebsplat.labels.agreement import project
 from chebsplat.pipelines.cli import main
 from chebsplat.render import SceneRenderer
+from chebsplat.stages.settings import IngestSection
+from chebsplat.stages.sources import colmap
 from chebsplat.stages.sources.colmap_model import read_model
 from chebsplat.stages.tools import camera_files, camera_paths
 from chebsplat.stages.tools.frames import kinds_of
@@ -35,7 +42,7 @@ TOLERANCE = 1e-12  # of text with all of a double's digits, through an inverse
 def folder(toy, tmp_path_factory):
     """A scene's folder of links."""
     made = tmp_path_factory.mktemp("scene")
-    for stage in ("ingest", "export", "teacher"):
+    for stage in ("ingest", "sfm", "export", "teacher"):
         (made / stage).symlink_to(toy[stage])
     return made
 
@@ -213,6 +220,63 @@ def test_written_cameras_are_read_back(tmp_path, read):
             assert (found.name, found.width, found.height) == (camera.name, 320, 240)
     with pytest.raises(ConfigError, match="exists"):
         camera_files.write_cameras(tmp_path, cameras)
+
+
+@pytest.mark.xdist_group("toy")
+def test_full_cameras_are_a_data_set_that_colmap_and_our_own_reader_understand(
+    folder, toy, tmp_path
+):
+    """Of the toy scene, with tracks, masks, a far world and names that are no file's added."""
+    capture, points = Capture.read(toy["ingest"]), Points.read(toy["sfm"])
+    run("cameras", folder, "--full", "--out", tmp_path / "plain")
+    plain = pycolmap.Reconstruction(tmp_path / "plain/sparse/0")
+    assert plain.num_points3D() == len(points.means) and plain.compute_num_observations() == 0
+
+    rng, world = np.random.default_rng(0), World((900.0, -70, 8), 3.0)
+    names = [f"left eye/{name}" for name in capture.names]
+    mask = rng.random(capture.images.shape[:3]) < 0.9
+    capture = replace(capture, names=names, loss_mask=mask, source=world.notes)
+    tracks = [
+        (row, view)
+        for view, (K, pose) in enumerate(zip(points.Ks, points.cam_from_world, strict=True))
+        for row in np.flatnonzero(project(points.means, K, pose, capture.size)[:, 2] > 0)[:8]
+    ]
+    points = replace(points, names=names[::-1], tracks=np.array(tracks, np.int32))
+    camera_files.write_capture(tmp_path / "full", capture, points)
+    model = pycolmap.Reconstruction(tmp_path / "full/sparse/0")
+    images = sorted(model.images.values(), key=lambda image: image.image_id)
+    assert [image.name for image in images] == [
+        f"left-eye-{name.rpartition('/')[2]}.png" for name in points.names
+    ]
+    poses = world.poses_outward(points.cam_from_world)
+    for image, K, pose, name in zip(images, points.Ks, poses, points.names, strict=True):
+        np.testing.assert_allclose(image.cam_from_world().matrix(), pose[:3], atol=1e-9)
+        camera, photo = (
+            model.cameras[image.camera_id],
+            picture(tmp_path / "full/images" / image.name),
+        )
+        np.testing.assert_array_equal(camera.calibration_matrix(), K)
+        assert (camera.model.name, camera.width, camera.height) == ("PINHOLE", *capture.size)
+        np.testing.assert_array_equal(photo, capture.images[names.index(name)])
+    assert sorted(model.points3D) == list(range(1, len(points.means) + 1))
+    found = [model.points3D[key] for key in sorted(model.points3D)]
+    np.testing.assert_allclose([p.xyz for p in found], world.outward(points.means), atol=1e-9)
+    np.testing.assert_array_equal([p.color for p in found], points.colors)
+    seen = [(row, e.image_id - 1) for row, p in enumerate(found) for e in p.track.elements]
+    assert sorted(seen) == sorted(tracks)
+    model.update_point_3d_errors()
+    assert max(p.error for p in found if p.track.length()) < 1e-9
+    again = colmap.read(tmp_path / "full", IngestSection(min_views=2))
+    rows = [names.index(f"left eye/{name.removeprefix('left-eye-')}") for name in again["names"]]
+    np.testing.assert_array_equal(again["images"][:], capture.images[:][rows])
+    np.testing.assert_array_equal(again["loss_mask"][:], mask[rows])
+    frames = json.loads((tmp_path / "full/transforms.json").read_text())["frames"]
+    for frame in frames:
+        assert (tmp_path / "full" / frame["file_path"]).is_file()
+        assert (tmp_path / "full" / frame["mask_path"]).is_file()
+    refused = run("cameras", folder, "--full", "--size", "8x6", "--out", tmp_path / "no", code=2)
+    assert "leave out --path" in refused.stderr
+    assert "exists" in run("cameras", folder, "--full", "--out", tmp_path / "plain", code=2).stderr
 
 
 @pytest.mark.parametrize(
