@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from chebsplat.errors import InputError
+from chebsplat.formats.files import LARGEST
 from chebsplat.formats.packed import C0, raw_parameters
 from chebsplat.formats.ply import REST
 from chebsplat.formats.semantics import Semantics
@@ -231,7 +232,11 @@ class _Opened:
         if (magic, version, kind) != (b"glTF", 2, b"JSON"):
             raise ValueError("it has no header of glTF 2")
         start = HEADER.size + CHUNK.size
+        if length > LARGEST:
+            raise ValueError(f"its document has {length:,} bytes, at most {LARGEST:,} are read")
         self.document: dict[str, Any] = json.loads(data[start : start + length])
+        if unknown := {*self.document.get("extensionsRequired", [])} - {SPLAT, IDS, TABLES}:
+            raise ValueError(f"it needs {', '.join(sorted(unknown))}")
         self.binary = data[start + length + CHUNK.size :]
         found = [
             primitive
@@ -262,11 +267,13 @@ class _Opened:
         if kind is None or accessor["type"] != SHAPES[width] or normalized == (kind == "float32"):
             raise ValueError(
                 f"{name} is {accessor['type']} of {accessor['componentType']}"
-                f"{', normalized' * normalized}"
+                f"{', normalized' if normalized else ''}"
             )
         dtype = np.dtype(kind).newbyteorder("<")
         row = width * dtype.itemsize
-        view = self.document["bufferViews"][accessor["bufferView"]]
+        if "sparse" in accessor:
+            raise ValueError(f"{name} is sparse")
+        view = self._view(accessor["bufferView"])
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         strides = max(view.get("byteStride", row), row), dtype.itemsize
         shape = accessor["count"], width
@@ -276,10 +283,17 @@ class _Opened:
     def column(self, table: int, name: str, kind: str) -> np.ndarray:
         """A property of a table, [rows, numbers of a row]."""
         rows = self.document["extensions"][TABLES]["propertyTables"][table]
-        view = self.document["bufferViews"][rows["properties"][name]["values"]]
+        view = self._view(rows["properties"][name]["values"])
         start = view.get("byteOffset", 0)
         values = np.frombuffer(self.binary[start : start + view["byteLength"]], kind)
         return values.reshape(rows["count"], -1)
+
+    def _view(self, number: int) -> dict[str, Any]:
+        """A buffer view of the file's own bytes."""
+        view: dict[str, Any] = self.document["bufferViews"][number]
+        if view["buffer"] != 0 or "uri" in self.document["buffers"][0]:
+            raise ValueError("its numbers lie in another file")
+        return view
 
 
 def read_splat_glb(path: Path) -> tuple[dict[str, np.ndarray], int]:

@@ -73,8 +73,8 @@ def _named(path: Path, stamp: tuple[int, ...]) -> tuple[str, ...] | None:
         if entry.key == "location"
     ]
     for name in names:
-        if os.path.isabs(name) or name.startswith(".."):
-            raise InputError(f"{path} has weights outside its folder ({name[:100]}); {EXPORT}")
+        if os.path.isabs(name) or name.startswith("..") or "\0" in name:
+            raise InputError(f"{path} has weights outside its folder ({name[:100]!r}); {EXPORT}")
     return tuple(dict.fromkeys(name for name in names if name != path.name))
 
 

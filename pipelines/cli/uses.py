@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -89,7 +90,8 @@ def get_teacher(
     model, findings = fetch(name, out, graph, settings, sha256)
     for what, finding in findings:
         print(f"{what:9s}{finding}", file=sys.stderr)
-    print(f"use it: set=teacher.model={model},teacher.n_channels=32", file=sys.stderr)
+    use = shlex.quote(f"set=teacher.model={model},teacher.n_channels=32")
+    print(f"use it: {use}", file=sys.stderr)
     print(model)
 
 

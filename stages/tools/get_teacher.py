@@ -70,6 +70,10 @@ def get_teacher(
       damaged or not reached.
     """
     if ADDRESS.fullmatch(name):
+        if graph != GRAPH:
+            raise ConfigError(
+                f"--file is of the hub's repositories, and {name} is a file; leave it"
+            )
         origin, short = full_address(name), stem_of(name)
         fill = partial(gather, name, settings)
     else:

@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from http.client import HTTPException
 from pathlib import Path
 from socket import gaierror
 from typing import Any
 from urllib.error import HTTPError, URLError
-from urllib.parse import quote, urljoin, urlsplit
+from urllib.parse import quote, unquote, urljoin, urlsplit
 from urllib.request import Request, url2pathname, urlopen
 
 from chebsplat.errors import InputError
@@ -19,7 +21,7 @@ from chebsplat.formats.files import regular
 from chebsplat.formats.onnx_files import is_graph, weight_files
 from chebsplat.formats.teacher_model import FILES, TEXT_PACKAGE, read_settings
 
-ADDRESS = re.compile(r"(?!hf:)(?:(?:https?|file):[^\s\[\]]+|.+\.(?:onnx|tflite))")
+ADDRESS = re.compile(r"(?!hf:|\w+://\[)(?:(?:https?|file):[^\s\[\]]+|.+\.(?:onnx|tflite))")
 SECONDS = 60.0  # that a server may be silent
 AGAIN = "run the same command again"
 
@@ -55,7 +57,8 @@ def gather(address: str, settings: str | None, graph: Path) -> dict[str, Any]:
         "--settings FILE.toml"
     )
     copy(toml, graph.with_suffix(".toml"), remedy)
-    values = read_settings(graph.with_suffix(".toml"))
+    with called(graph.with_suffix(".toml"), toml):
+        values = read_settings(graph.with_suffix(".toml"))
     sources = {graph: address}
     for key in FILES:
         if key in values and not (key == "text" and values[key] == TEXT_PACKAGE):
@@ -67,8 +70,10 @@ def gather(address: str, settings: str | None, graph: Path) -> dict[str, Any]:
     for place, source in sources.items():
         if place.suffix != ".onnx":
             continue
-        check_graph(place, source)
-        for name in weight_files(place):
+        with called(place, source):
+            check_graph(place, source)
+            names = weight_files(place)
+        for name in names:
             (weights := place.parent / name).parent.mkdir(parents=True, exist_ok=True)
             copy(_beside(source, name), weights, f"{source} keeps weights there: correct it")
     return values
@@ -86,8 +91,9 @@ def copy(address: str, place: Path, remedy: str) -> None:
     try:
         request = Request(address, headers={"User-Agent": "chebsplat"})
         with urlopen(request, timeout=SECONDS) as answer, place.open("wb") as file:
+            length = answer.headers["Content-Length"]
+            expected = None if length is None else int(length)
             shutil.copyfileobj(answer, file)
-            expected = answer.headers["Content-Length"]
     except HTTPError as fault:
         fault.close()
         raise InputError(f"{address}: the server answers {fault.code}; {remedy}") from None
@@ -98,9 +104,17 @@ def copy(address: str, place: Path, remedy: str) -> None:
         raise InputError(
             f"{address} is not reached ({reason}); correct the address, or connect and {AGAIN}"
         ) from None
-    if expected is not None and place.stat().st_size != int(expected):
-        size = place.stat().st_size
-        raise InputError(f"{address} broke off at {size:,} of {int(expected):,} bytes; {AGAIN}")
+    if expected is not None and (size := place.stat().st_size) != expected:
+        raise InputError(f"{address} broke off at {size:,} of {expected:,} bytes; {AGAIN}")
+
+
+@contextmanager
+def called(place: Path, address: str) -> Iterator[None]:
+    """Errors of a copy name the address that it is of, since the copy goes."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error).replace(str(place), address)) from None
 
 
 def check_graph(path: Path, address: str) -> None:
@@ -124,7 +138,7 @@ def _here(address: str) -> Path | None:
 
 def _file(address: str) -> Path:
     """The path in an address, with the name of its file."""
-    return _here(address) or Path(urlsplit(address).path)
+    return _here(address) or Path(unquote(urlsplit(address).path))
 
 
 def _beside(address: str, name: str) -> str:

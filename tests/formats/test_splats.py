@@ -325,6 +325,11 @@ def accessor(document, name, **changes):
         (lambda d: accessor(d, "POSITION", bufferView=99), "no GLB of Gaussians"),
         (lambda d: d["bufferViews"][3].update(byteOffset=0), "below 0"),
         (lambda d: d["nodes"][0].update(scale=[2, 2, 2]), "a node of it is moved"),
+        (lambda d: accessor(d, "POSITION", sparse={"count": 1}), "POSITION is sparse"),
+        (lambda d: accessor(d, "POSITION", type="VEC4", normalized=10**14), "VEC4 of 5126, norm"),
+        (lambda d: d["bufferViews"][0].update(buffer=1), "lie in another file"),
+        (lambda d: d["buffers"][0].update(uri="a.bin"), "lie in another file"),
+        (lambda d: d.update(extensionsRequired=["EXT_meshopt_compression"]), "it needs EXT_mesh"),
         (
             lambda d: splats_of(d)["extensions"]["KHR_gaussian_splatting"].update(
                 colorSpace="lin_rec709_display"
@@ -416,6 +421,7 @@ def spz(version, n, degree):
     ("a.SOG", b"any", "is cut or no SOG of version 2"),
     ("a.glb", b"any", "is no GLB of Gaussians that is read"),
     ("a.glb", struct.pack("<4sIII4s", b"glTF", 1, 99, 9, b"JSON"), "no header of glTF 2"),
+    ("a.glb", struct.pack("<4sIII4s", b"glTF", 2, 99, 1 << 30, b"JSON"), "1,073,741,824 bytes"),
     ("a.splat", bytes(33), "no multiple of 32"),
     ("a.spz", b"any", "is cut or no SPZ"),
     ("a.spz", spz(4, 1, 0) + bytes(16), "is cut or no SPZ of version 2 to 4"),

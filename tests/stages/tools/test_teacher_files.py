@@ -25,6 +25,13 @@ class Cut(Quiet):
         outputfile.write(content[:100] if self.path.endswith(".onnx") else content)
 
 
+class Odd(Quiet):
+    """Says a length that is no number."""
+
+    def send_header(self, keyword, value):
+        super().send_header(keyword, "odd" if keyword == "Content-Length" else value)
+
+
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     """A segmenter of colours on offer, in a folder whose name a URL has to quote, a folder to stand
@@ -76,6 +83,14 @@ def test_an_onnx_file_becomes_a_teacher_wherever_it_lies(place, tmp_path, kind, 
     assert not list(tmp_path.rglob(".part-*"))
 
 
+def test_a_name_that_a_url_quotes_is_read_as_it_is(place):
+    for path in (place, place.with_suffix(".toml")):
+        path.rename(path.with_stem("my tiny"))
+    with served(place.parent) as server:
+        model, _ = get_teacher(f"{server}/my%20tiny.onnx")
+    assert str(model) == "my tiny/my tiny.onnx"
+
+
 def test_what_brings_no_toml_takes_the_user_s_own(place, tmp_path):
     (tmp_path / "mine").mkdir()
     for name in ("tiny.toml", "the colours.txt"):
@@ -107,6 +122,11 @@ def last_axes(path):
     onnx.save(model, path)
 
 
+def renamed_weights(path, name):
+    moved_out(path, "weights.bin")
+    path.write_bytes(path.read_bytes().replace(b"weights.bin", name))
+
+
 REFUSED = {
     "a page": (lambda f: f.write_text("<!DOCTYPE html>"), "is no ONNX graph, it begins with b'<!"),
     "nothing": (lambda f: f.write_bytes(b""), "is no ONNX graph"),
@@ -124,6 +144,15 @@ REFUSED = {
         lambda f: (moved_out(f, "weights.bin"), (f.parent / "weights.bin").unlink()),
         "keeps weights there",
     ),
+    "weights of ours": (
+        lambda f: renamed_weights(f, b"../ghts.bin"),
+        r"^http\S*/tiny.onnx has weights outside",
+    ),
+    "weights of no name": (
+        lambda f: renamed_weights(f, b"weig\0ts/bin"),
+        r"^http\S*/tiny.onnx has weights outside",
+    ),
+    "a list of sides": (lambda f: toml(f, base="[1]"), r"^http\S*/tiny.toml: base = \[1\]"),
     "weights in the place of labels": (lambda f: moved_out(f, "tiny.labels.txt"), "of two files"),
 }  # fmt: skip
 
@@ -153,8 +182,11 @@ def test_what_is_not_reached_or_read_is_one_line(place, address, word):
         get_teacher(address)
 
 
-def test_a_download_that_broke_off_is_no_teacher(place, tmp_path):
-    with served(place.parent, Cut) as server, pytest.raises(InputError, match="broke off at 100"):
+@pytest.mark.parametrize(
+    ("handler", "word"), [(Cut, "broke off at 100 of"), (Odd, "is not reached .*'odd'")]
+)
+def test_a_download_that_broke_off_is_no_teacher(place, tmp_path, handler, word):
+    with served(place.parent, handler) as server, pytest.raises(InputError, match=word):
         get_teacher(f"{server}/tiny.onnx")
     assert not list((tmp_path / "here").iterdir())
 
@@ -167,6 +199,14 @@ def test_a_toml_of_others_takes_no_file_of_ours(place, tmp_path):
             get_teacher(f"{server}/tiny.onnx")
 
 
-def test_the_settings_of_the_hub_s_models_are_their_own():
-    with pytest.raises(ConfigError, match="brings its own"):
-        get_teacher("segformer-b0-ade", settings="a.toml")
+@pytest.mark.parametrize(
+    ("name", "options", "word"),
+    [
+        ("segformer-b0-ade", {"settings": "a.toml"}, "brings its own"),
+        ("a.onnx", {"graph": "b.onnx"}, "--file is of the hub's"),
+        ("http://[x/a.onnx", {}, "is no teacher"),
+    ],
+)
+def test_options_that_would_do_nothing_and_addresses_that_are_none_are_refused(name, options, word):
+    with pytest.raises(ConfigError, match=word):
+        get_teacher(name, **options)
