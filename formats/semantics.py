@@ -60,8 +60,9 @@ class Semantics:
         shared = rows[:, 1:].astype(np.float32)
         return cls(meanings.reshape(-1), rows[:, 0].astype(np.int32), shared, names, embeddings)
 
-    def write(self, splat: Path, order: np.ndarray) -> None:
-        """Write it beside a splat whose Gaussians are these in `order`, i64 [N].
+    def write(self, splat: Path, content: Path, order: np.ndarray) -> None:
+        """Write it beside a splat whose Gaussians are these in `order`, i64 [N]; content: a file of
+        the same bytes.
 
         Raises: ValueError on more rows than two bytes count.
         """
@@ -75,7 +76,7 @@ class Semantics:
                 features=self.features.astype(np.float16),
                 names=np.array(self.names),
                 embeddings=self.embeddings,
-                splat=np.array(sha256_file(splat)),
+                splat=np.array(sha256_file(content)),
             )
 
 

@@ -109,19 +109,18 @@ def write_splats(
     suffix, degree = path.suffix.lower(), int(parameters["degrees"].max())
     if suffix not in WRITTEN or path.name.endswith(".compressed.ply"):
         raise ConfigError(f"{path}: a splat is written as {', '.join(WRITTEN)}; name it so")
-    order = None
     with atomic_path(path) as temporary:
         if suffix in (".spz", ".sog"):
             write = write_spz if suffix == ".spz" else write_sog
             order = write(temporary, parameters, degree, world)
+            if semantics is not None:  # first, so that no whole file lies there without them
+                semantics.write(path, temporary, order)
         elif suffix == ".glb":
             write_splat_glb(temporary, parameters, degree, semantics, world)
         else:
             labels = None if semantics is None else semantics.labels[semantics.meanings]
             names = None if semantics is None else semantics.names
             write_ply(temporary, parameters, degree, labels, names, world)
-    if semantics is not None and order is not None:
-        semantics.write(path, order)
 
 
 def _splat(path: Path) -> tuple[dict[str, np.ndarray], int]:

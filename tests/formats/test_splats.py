@@ -198,6 +198,19 @@ def meaning():
     return Semantics.of(features[rows], labels, ["wall", "café", "sofa"], words)
 
 
+@pytest.mark.parametrize("ending", ["spz", "sog"])
+def test_a_stopped_export_leaves_no_splat_without_its_labels(tmp_path, monkeypatch, ending):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez_compressed", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        write_splats(
+            tmp_path / f"a.{ending}", given(1) | {"degrees": np.ones(N, np.uint8)}, meaning()
+        )
+    assert not list(tmp_path.iterdir())
+
+
 def parts_of(path):
     """The document of a GLB and the bytes after it."""
     raw = path.read_bytes()
