@@ -160,7 +160,7 @@ def _free_second_term(model: pycolmap.Reconstruction) -> None:
     """Let r⁴ bend the lens, too, once poses are near: SIMPLE_RADIAL becomes RADIAL.
 
     Choices: against the truth of rendered rooms through lenses with both terms, rotations miss by
-      .06 to .16° instead of .14 to .80, centres by .3 to .9 cm instead of .6 to 4.7. While photos
+      .06 to .19° instead of .13 to .80, centres by .3 to .9 cm instead of .4 to 4.7. While photos
       are still being placed, one term is the safer guess. OPENCV's tangential terms help nothing.
     """
     for camera in model.cameras.values():
