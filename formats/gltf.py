@@ -238,16 +238,16 @@ class _Opened:
         if unknown := {*self.document.get("extensionsRequired", [])} - {SPLAT, IDS, TABLES}:
             raise ValueError(f"it needs {', '.join(sorted(unknown))}")
         self.binary = data[start + length + CHUNK.size :]
-        found = [
+        primitives = [
             primitive
             for mesh in self.document.get("meshes", [])
             for primitive in mesh["primitives"]
             if SPLAT in primitive.get("extensions", {})
         ]
-        if len(found) != 1:
-            raise ValueError(f"it has {len(found)} primitives of Gaussians, one is read")
-        self.primitive: dict[str, Any] = found[0]
-        kernel = found[0]["extensions"][SPLAT]
+        if len(primitives) != 1:
+            raise ValueError(f"it has {len(primitives)} primitives of Gaussians, one is read")
+        self.primitive: dict[str, Any] = primitives[0]
+        kernel = primitives[0]["extensions"][SPLAT]
         if kernel.get("extensions"):
             raise ValueError(f"its Gaussians are packed by {', '.join(kernel['extensions'])}")
         if (kernel.get("kernel"), kernel.get("colorSpace")) != ("ellipse", COLORS):
@@ -300,8 +300,8 @@ def read_splat_glb(path: Path) -> tuple[dict[str, np.ndarray], int]:
     """Raw parameters in the axes of PLY files, and the degree. Raises InputError with the path."""
     try:
         glb = _Opened(path)
-        held = glb.primitive["attributes"]
-        degree = max(d for d in REST if d == 0 or f"{SPLAT}:SH_DEGREE_{d}_COEF_0" in held)
+        attributes = glb.primitive["attributes"]
+        degree = max(d for d in REST if d == 0 or f"{SPLAT}:SH_DEGREE_{d}_COEF_0" in attributes)
         means, scales, quats, opacities = (glb.attribute(name, *PARTS[name]) for name in PARTS)
         light = np.stack([glb.attribute(name, 3) for name in _light_names(degree)], 1)
         if not (scales >= 0).all() or not ((opacities >= 0) & (opacities <= 1)).all():
@@ -323,7 +323,7 @@ def read_splat_glb(path: Path) -> tuple[dict[str, np.ndarray], int]:
 
 
 def read_meanings(path: Path) -> Semantics | None:
-    """What a GLB of Gaussians says of their meanings, None where it is not ours that says it.
+    """The meanings that a GLB of Gaussians has of them; None where they are not in our form.
 
     Raises: InputError with the path.
     """

@@ -1,4 +1,4 @@
-"""What the Gaussians of a splat mean, as a table of meanings that they share, to travel with it.
+"""Meanings of the Gaussians of a splat, a table of rows that they share, to travel with it.
 
 A GLB holds it itself (`gltf.write_splat_glb`). Beside an SPZ or SOG lies `office0.spz.labels.npz`,
 which numpy reads alone (`examples/count_labels.py`): `meanings` u16 [N], each Gaussian's row in the

@@ -84,7 +84,7 @@ def read_splats(
 
 
 def read_semantics(path: Path) -> Semantics | None:
-    """What the Gaussians of a splat mean, in its order: told by a GLB itself, or beside the file.
+    """Meanings of the Gaussians of a splat, in its order: of a GLB itself, or beside the file.
 
     None where nothing is told. Raises: InputError naming the file.
     """

@@ -26,19 +26,19 @@ def rounded_light(parameters: dict[str, np.ndarray], eyes: np.ndarray) -> dict[s
       squares over the sides that the eyes are on, and one from all around, which keeps other views
       near. Whether a camera looks there makes no difference. Bands of zero stay zero.
     """
-    known = len(eyes) > 1
-    step, eyes = (STEP, eyes) if known else (ALONE, eyes[:0])
+    has_cameras = len(eyes) > 1
+    step, eyes = (STEP, eyes) if has_cameras else (ALONE, eyes[:0])
     eyes = eyes[np.linspace(0, len(eyes) - 1, min(len(eyes), EYES)).astype(int)]
     light = np.concatenate([parameters["sh0"], parameters["shN"]], 1).astype(np.float64)
     lit = np.flatnonzero(light[:, 1:].any((1, 2)))
     for rows in np.array_split(lit, len(lit) // BLOCK + 1):
         part = light[rows]
         lower = np.linalg.cholesky(_sides(parameters["means"][rows].astype(np.float64), eyes))
-        taken = -np.diagonal(lower, axis1=1, axis2=2)[..., None] * np.linalg.inv(lower)
+        shares = -np.diagonal(lower, axis1=1, axis2=2)[..., None] * np.linalg.inv(lower)
         for k in range(part.shape[1] - 1, 0, -1):
             exact = part[:, k].copy()
             part[:, k] = step * np.rint(exact.clip(-1, 1) / step)
-            part[:, :k] += taken[:, k, :k, None] * (exact - part[:, k])[:, None]
+            part[:, :k] += shares[:, k, :k, None] * (exact - part[:, k])[:, None]
         light[rows] = part
     changed = {"sh0": light[:, :1], "shN": light[:, 1:]}
     return parameters | {name: values.astype(np.float32) for name, values in changed.items()}

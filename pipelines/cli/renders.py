@@ -143,12 +143,12 @@ def cameras(
     if full:
         of = str(scene_folder(scene))
         read = Capture.read(artifact_of(of, "ingest")), Points.read(artifact_of(of, "sfm"))
-        made = write_capture(out, *read)
+        paths = write_capture(out, *read)
     else:
         pixels = size_of(size)
-        found = path_of(load(scene), path, frames, up)
-        made = write_cameras(out, [fitted(camera, pixels) for camera in found])
-    print(*(path.absolute() for path in made), sep="\n")
+        cameras_of_path = path_of(load(scene), path, frames, up)
+        paths = write_cameras(out, [fitted(camera, pixels) for camera in cameras_of_path])
+    print(*(path.absolute() for path in paths), sep="\n")
 
 
 @click.command()

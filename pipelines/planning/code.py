@@ -56,15 +56,15 @@ class Code:
         self._stages: dict[tuple[str, ...], dict[str, Any]] = {}
 
     def stage(
-        self, name: str, used: tuple[str, ...] = (), chosen: tuple[str, ...] = ()
+        self, name: str, used: tuple[str, ...] = (), modules_used: tuple[str, ...] = ()
     ) -> dict[str, Any]:
         """{"hash": ..., "packages": {name: version}} of stage `name`; computed once by this object.
 
         Args: used: packages of extras that the configuration uses; others of OPTIONAL are no part
-          of the identity. chosen: modules of ours that the configuration chooses, which no import
-          names.
+          of the identity. modules_used: those of ours that the configuration chooses, which no
+          import names.
         """
-        modules = (f"chebsplat.stages.{name}", *chosen)
+        modules = (f"chebsplat.stages.{name}", *modules_used)
         if modules not in self._stages:
             self._stages[modules] = self._identity(modules)
         identity = self._stages[modules]

@@ -163,7 +163,9 @@ def rates(cores: int, device: str) -> dict[str, float]:
                 manifests[stage] = parse_manifest(path)
         try:
             semantic = "train" in manifests and "features" in manifests["train"].inputs
-            of = facts_of({stage: made.config for stage, made in manifests.items()}, semantic)
+            of = facts_of(
+                {stage: manifest.config for stage, manifest in manifests.items()}, semantic
+            )
         except KeyError:  # of a study, or made by another version, with other settings
             continue
         for stage in manifests.keys() & STAGES:

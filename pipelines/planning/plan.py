@@ -358,8 +358,8 @@ class Planner:
         raw = hashes(files, self.file_memo.values)
         device = stage.device(self.device, sections)
         computing = stage.device_packages if device == "cuda" else ()
-        chosen = (protocols.module_of(config.ingest.protocol),) if stage.of_protocol else ()
-        code = self.code.stage(stage.name, (*used, *computing, *media_packages(files)), chosen)
+        protocol = (protocols.module_of(config.ingest.protocol),) if stage.of_protocol else ()
+        code = self.code.stage(stage.name, (*used, *computing, *media_packages(files)), protocol)
         content = content_hash(raw, root) if raw or stage.name in ("pose", "ingest") else None
         key = step_key(stage, sections, keys, code, content, device)
         return Step(

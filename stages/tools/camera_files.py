@@ -53,8 +53,8 @@ def write_cameras(
         folder / "cameras.json": gs_cameras(cameras),
     }
     stacks = {folder / form: of for form, of in photos.items()}
-    made = [model, *texts, *(path.parent for path in stacks)]
-    for path in made:
+    outputs = [model, *texts, *(path.parent for path in stacks)]
+    for path in outputs:
         if path.exists():
             raise ConfigError(f"{path} exists; remove it, or choose another --out")
     for path, of in stacks.items():
@@ -66,7 +66,7 @@ def write_cameras(
         colmap_model(cameras, cloud).write_binary(model)
     for path, document in texts.items():
         atomic_write(path, json.dumps(document, indent=1))
-    return made
+    return outputs
 
 
 def write_capture(folder: Path, capture: Capture, points: Points) -> list[Path]:
@@ -125,13 +125,13 @@ def colmap_model(cameras: Sequence[Camera], cloud: Points | None) -> pycolmap.Re
             )
         image = pycolmap.Image(name=f"{camera.name}.png", camera_id=key, image_id=index + 1)
         if cloud is not None:
-            seen = np.unique(cloud.tracks[cloud.tracks[:, 1] == index, 0])
+            visible = np.unique(cloud.tracks[cloud.tracks[:, 1] == index, 0])
             pose = camera.cam_from_world
-            rays = (cloud.means[seen] @ pose[:3, :3].T + pose[:3, 3]) @ camera.K.T
+            rays = (cloud.means[visible] @ pose[:3, :3].T + pose[:3, 3]) @ camera.K.T
             image.points2D = pycolmap.Point2DList(
                 [pycolmap.Point2D(xy) for xy in rays[:, :2] / rays[:, 2:]]
             )
-            for place, row in enumerate(seen):
+            for place, row in enumerate(visible):
                 tracks[row].append(pycolmap.TrackElement(index + 1, place))
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.cam_from_world[:3]))
     if cloud is not None:

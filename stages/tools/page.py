@@ -188,21 +188,21 @@ def with_own_semantics(scene: Scene, splat: Path) -> Scene:
 
     Raises: InputError where that is of another number of Gaussians.
     """
-    told = read_semantics(splat)
-    if told is None:
+    semantics = read_semantics(splat)
+    if semantics is None:
         return scene
-    if len(told.meanings) != len(scene.order):
+    if len(semantics.meanings) != len(scene.order):
         raise InputError(
             f"{splat} has {len(scene.order)} Gaussians that can be shown and tells the meanings of "
-            f"{len(told.meanings)}; export the scene again"
+            f"{len(semantics.meanings)}; export the scene again"
         )
-    rows = told.meanings[scene.order]
+    rows = semantics.meanings[scene.order]
     return replace(
         scene,
-        parameters=scene.parameters | {"features": told.features[rows]},
-        labels=told.labels[rows].astype(np.int32),
-        label_names=told.names,
-        label_embeddings=told.embeddings,
+        parameters=scene.parameters | {"features": semantics.features[rows]},
+        labels=semantics.labels[rows].astype(np.int32),
+        label_names=semantics.names,
+        label_embeddings=semantics.embeddings,
     )
 
 

@@ -228,7 +228,7 @@ class OpenedScene:
         return OpenedScene(part, self.source, self._teacher)
 
     def semantics(self) -> Semantics | None:
-        """What the Gaussians mean, as a table that travels with a file; None without semantics."""
+        """Meanings of the Gaussians, a table that travels with a file; None without semantics."""
         if self.labels is None or self.label_names is None or self.label_embeddings is None:
             return None
         features = self.parameters["features"]

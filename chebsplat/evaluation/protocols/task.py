@@ -1,4 +1,4 @@
-"""What protocols share: the rule of their views; their input, which is evaluated views one by one
+"""Shared by protocols: the rule of their views; their input, which is evaluated views one by one
 and the names of labels and classes; and ways to compare labels.
 """
 
@@ -17,7 +17,7 @@ from chebsplat.labels.names import lacking, rows_of
 
 @dataclass(frozen=True)
 class Rule:
-    """Which views a protocol tests, and against what.
+    """The views that a protocol tests, and their truth.
 
     side: pixels of a view's longest side, unless `ingest.max_side` says another.
     test_every, test_offset: a view is a test view if its index among the names, modulo the one, is
