@@ -9,12 +9,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-import numba
 import numpy as np
 import torch
 
 from benchmarks import shared
 from benchmarks.stability import oracle
+from chebsplat.kernels.threads import n_threads, set_n_threads
 from chebsplat.settings import DescribeSection
 from chebsplat.shape.described import Descriptor
 from chebsplat.shape.descriptor import describe
@@ -99,8 +99,8 @@ def main(arguments: Sequence[str]) -> int:
     print(shared.machine())
     errors = {"clouds": error(clouds(2, 32)), "room": error(room(2, 32))}
     regions, rows = clouds(2048, N), []
-    for threads in [n for n in (1, 2, 4) if n <= numba.config.NUMBA_NUM_THREADS]:
-        numba.set_num_threads(threads)
+    for threads in [n for n in (1, 2, 4) if n <= n_threads()]:
+        set_n_threads(threads)
         rate = len(regions[0]) / best(lambda: described(regions), options.repeats)
         rows.append({"what": f"regions a second, {threads} threads", "value": rate})
     torch.set_num_threads(1)

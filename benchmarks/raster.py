@@ -15,11 +15,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 
 from benchmarks import shared
+from chebsplat.kernels.threads import set_n_threads
 from chebsplat.rasterize import binning, ellipses, rasterize, tiles, tiles_adjoint
 from chebsplat.training.losses import feature_distance, photometric
 
@@ -155,7 +155,7 @@ def take_turns(variants: dict[str, tuple[int, Action]], rounds: int) -> dict[str
     for _ in range(rounds):
         for name, (n, action) in variants.items():
             torch.set_num_threads(n)
-            numba.set_num_threads(min(n, numba.config.NUMBA_NUM_THREADS))
+            set_n_threads(n)
             action()
             began = time.perf_counter()
             action()

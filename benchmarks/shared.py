@@ -15,6 +15,7 @@ import numba
 import torch
 
 import chebsplat
+from chebsplat.kernels.threads import n_threads
 from chebsplat.pipelines.planning.plan import Plan, Planner
 from chebsplat.pipelines.running.run import execute
 from chebsplat.pipelines.work.scenes import data_of
@@ -88,7 +89,7 @@ def machine() -> str:
     return (
         f"chebsplat {chebsplat.__version__}, torch {torch.__version__} on "
         f"{torch.get_num_threads()} threads, numba {numba.__version__} on "
-        f"{numba.get_num_threads()}; {processor()}, {cores()} cores, load {load():.1f}"
+        f"{n_threads()}; {processor()}, {cores()} cores, load {load():.1f}"
     )
 
 

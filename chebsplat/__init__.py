@@ -17,10 +17,6 @@ from typing import Any
 # Must precede torch.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-# One OpenMP serves numba and torch, and numba's first kernel sets the number of threads of both:
-# let it be the same.
-if os.environ.get("OMP_NUM_THREADS", "").isdigit():
-    os.environ.setdefault("NUMBA_NUM_THREADS", os.environ["OMP_NUM_THREADS"])
 # onnxruntime writes an id of the machine into the home folder and reports to its maker, from its
 # import on, unless this is set before. ORT_DISABLE_TELEMETRY=0 is for who wants that.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")

@@ -21,8 +21,9 @@ from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.images import images_below, read_rgb
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
+from chebsplat.kernels.threads import n_threads
 from chebsplat.labels import channels as maths
-from chebsplat.stages.runtime.command import Job, n_threads
+from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.settings import ChannelsSection
 from chebsplat.stages.sources.generated import SIZES, photograph
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference

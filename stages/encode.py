@@ -9,8 +9,9 @@ from chebsplat.errors import DataFailure
 from chebsplat.formats.descriptors import Descriptors
 from chebsplat.formats.encoding import Encoding
 from chebsplat.formats.knowledge import read_knowledge
+from chebsplat.kernels.threads import n_threads
 from chebsplat.shape.point_encoder import PointEncoder
-from chebsplat.stages.runtime.command import Job, n_threads
+from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.shape_models.answers import inputs_of
 
 

@@ -20,6 +20,7 @@ from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.knowledge import Knowledge, write_knowledge
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
+from chebsplat.kernels.threads import n_threads
 from chebsplat.labels.decode import decode_labels
 from chebsplat.settings import DescribeSection
 from chebsplat.shape import point_encoder
@@ -37,7 +38,7 @@ from chebsplat.shape.lessons import (
     summed,
 )
 from chebsplat.shape.point_encoder import Example, PointEncoder, cloud_of
-from chebsplat.stages.runtime.command import Job, n_threads
+from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.settings import TeachSection
 from chebsplat.stages.shape_models.answers import SEEN, units
 from chebsplat.stages.shape_models.teaching_rooms import Room, load_room, prepare, room_path

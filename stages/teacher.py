@@ -15,9 +15,10 @@ from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.features import Features, FeatureWriter
 from chebsplat.formats.onnx_files import model_sha256
 from chebsplat.formats.teacher_model import EMBEDDED, read_teacher
+from chebsplat.kernels.threads import n_threads
 from chebsplat.labels import noisy_teacher as model
 from chebsplat.labels.decode import class_codes, decode, voted
-from chebsplat.stages.runtime.command import Job, n_threads
+from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.settings import MAX_CHANNELS, TeacherSection
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.stages.teacher_models.label_space import closed_set, label_set, open_vocabulary

@@ -5,10 +5,14 @@ worker.
 # before torch: OpenMP threads that spin slow parallel tests down
 import chebsplat  # noqa: F401  # isort: skip
 import json
+import os
 
 import pytest
 from shared import INPUTS, KEY, ROOT, TOY, remember, run_stage
 from tiny_teachers import color_reference, color_teacher, knowing_rooms
+
+# gsply runs on numba's threads, and open3d brings a TBB that numba refuses with a warning
+os.environ["NUMBA_THREADING_LAYER_PRIORITY"] = "omp workqueue tbb"
 
 
 @pytest.fixture(scope="session")

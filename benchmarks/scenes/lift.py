@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 import torch
 
@@ -18,6 +17,7 @@ from benchmarks import shared
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
+from chebsplat.kernels.threads import set_n_threads
 from chebsplat.lifting.observations import Observations, estimate, gathered, to_cells
 from chebsplat.rasterize.lift import lift
 from chebsplat.splats.gaussians import activated
@@ -32,7 +32,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args(arguments)
-    numba.set_num_threads(options.threads)
+    set_n_threads(options.threads)
     capture, scene = Capture.read(options.work / "ingest"), Gaussians.read(options.work / "train")
     features = Features.read(options.work / "teacher")
     raw = {name: torch.from_numpy(values) for name, values in scene.parameters.items()}

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+import numba.extending
 from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 
@@ -85,8 +86,6 @@ _keep_freed_memory()
 DIGEST = _digest()
 FOLDER = next(filter(_writable, _folders()), None)
 settings: Any = numba.config
-# open3d brings a TBB that numba refuses with a warning: OpenMP comes first.
-settings.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
 if FOLDER is None:
     log.warning("kernels are compiled, and not kept")
 else:
@@ -200,15 +199,8 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 # No fast-math but contraction: NaN and infinity keep their meaning. Not reassociation either, for
 # kernels just compiled then differ in the last bit from the same ones read from the cache.
-# Threads share what prange says and nothing else: to wake them for np.zeros takes ten times as long
-# as to fill it.
-PRANGE_ALONE = dict.fromkeys(
-    ("comprehension", "inplace_binop", "setitem", "numpy", "stencil", "fusion"), False
-)
-kernel: Any = _compiled(parallel=PRANGE_ALONE, fastmath={"contract", "nsz"})
-# of a kernel's loop: half the seconds of compiling it in the loop
-body: Any = _compiled(fastmath={"contract", "nsz"})
-inline: Any = _compiled(fastmath={"contract", "nsz"}, inline="always")
+kernel: Any = _compiled(fastmath={"contract", "nsz"}, nogil=True)  # that `threads` may share
+body: Any = _compiled(fastmath={"contract", "nsz"})  # of a kernel
 lanes: Any = _compiled(fastmath={"contract"})  # of explicit vectors and their scalars
 serial: Any = _compiled()
-prange = numba.prange
+plain: Any = numba.extending.register_jitable  # a small function that Python calls, too

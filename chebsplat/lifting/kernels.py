@@ -10,15 +10,14 @@ import math
 
 import numpy as np
 
-from chebsplat.kernels.jit import kernel, prange, serial
-
-PARTS = 64  # Gaussians are dealt out in so many, whatever the threads
+from chebsplat.kernels.jit import kernel, serial
+from chebsplat.kernels.threads import in_parts
 
 
 @kernel
-def place(ids, weights, sums, view, cursors, views, to_weights, to_means):
+def place(first, last, ids, weights, sums, view, cursors, views, to_weights, to_means):
     """Append one view's observations, each Gaussian at most once: at its cursor, which moves on."""
-    for m in prange(len(ids)):
+    for m in range(first, last):
         row = cursors[ids[m]]
         cursors[ids[m]] = row + 1
         views[row], to_weights[row] = view, weights[m]
@@ -88,28 +87,34 @@ def _average(means, weights, lengths, first, last, mask, steps, floor, factors, 
 
 
 @kernel
-def averages(starts, views, weights, means, half_of, steps, floor):
-    """Averages f32 [3, N, C] over all views and each half, `half_of` [V]; agreement r f32 [N]."""
-    n, channels = len(starts) - 1, means.shape[1]
-    features, agreement = np.zeros((3, n, channels), np.float32), np.zeros(n, np.float32)
-    for part in prange(PARTS):
-        longest = 0
-        for i in range(part * n // PARTS, (part + 1) * n // PARTS):
-            longest = max(longest, starts[i + 1] - starts[i])
-        lengths, factors, direction = np.empty(longest), np.empty(longest), np.empty(channels)
-        mask = np.empty(longest, np.bool_)
-        for i in range(part * n // PARTS, (part + 1) * n // PARTS):
-            first, last = starts[i], starts[i + 1]
+def _averages(
+    begin, end, starts, views, weights, means, half_of, steps, floor, features, agreement
+):  # fmt: skip
+    channels, longest = means.shape[1], 0
+    for i in range(begin, end):
+        longest = max(longest, starts[i + 1] - starts[i])
+    lengths, factors, direction = np.empty(longest), np.empty(longest), np.empty(channels)
+    mask = np.empty(longest, np.bool_)
+    for i in range(begin, end):
+        first, last = starts[i], starts[i + 1]
+        for row in range(first, last):
+            square = 0.0
+            for c in range(channels):
+                square += np.float64(means[row, c]) * means[row, c]
+            lengths[row - first] = max(math.sqrt(square), 1e-12)
+        for half in range(3):
             for row in range(first, last):
-                square = 0.0
-                for c in range(channels):
-                    square += np.float64(means[row, c]) * means[row, c]
-                lengths[row - first] = max(math.sqrt(square), 1e-12)
-            for half in range(3):
-                for row in range(first, last):
-                    mask[row - first] = half == 0 or half_of[views[row]] == half - 1
-                r = _average(means, weights, lengths, first, last, mask, steps, floor, factors,
-                             direction, features[half, i])  # fmt: skip
-                if half == 0:
-                    agreement[i] = r
+                mask[row - first] = half == 0 or half_of[views[row]] == half - 1
+            r = _average(means, weights, lengths, first, last, mask, steps, floor, factors,
+                         direction, features[half, i])  # fmt: skip
+            if half == 0:
+                agreement[i] = r
+
+
+def averages(starts, views, weights, means, half_of, steps, floor) -> tuple[np.ndarray, np.ndarray]:
+    """Averages f32 [3, N, C] over all views and each half, `half_of` [V]; agreement r f32 [N]."""
+    n = len(starts) - 1
+    features, agreement = np.zeros((3, n, means.shape[1]), np.float32), np.zeros(n, np.float32)
+    in_parts(_averages, n, starts, views, weights, means, half_of, steps, floor, features,
+             agreement)  # fmt: skip
     return features, agreement

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from chebsplat.kernels.threads import in_parts
 from chebsplat.lifting import kernels
 from chebsplat.rasterize.cells import CELL
 from chebsplat.rasterize.lift import Lifted
@@ -77,9 +78,8 @@ def gathered(n: int, n_channels: int, views: Iterable[Lifted]) -> Observations:
         np.empty((size, n_channels), np.float32),
     )
     for number, view in enumerate(lifted):
-        kernels.place(
-            *view, number, cursors, observations.views, observations.weights, observations.means
-        )
+        in_parts(kernels.place, len(view.ids), *view, number, cursors, observations.views,
+                 observations.weights, observations.means)  # fmt: skip
     return observations
 
 
@@ -99,7 +99,13 @@ def estimate(
     starts, enough = observations.starts, observations.weights >= min_weight
     half_of = halves_of(int(observations.views.max(initial=-1)) + 1)
     features, agreement = kernels.averages(
-        *vars(observations).values(), half_of, median_steps, NEAREST
+        starts,
+        observations.views,
+        observations.weights,
+        observations.means,
+        half_of,
+        median_steps,
+        NEAREST,
     )
     owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     n = len(starts) - 1

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from chebsplat.kernels.jit import body, kernel, prange
+from chebsplat.kernels.jit import body, kernel
+from chebsplat.kernels.threads import in_parts
 
 BAND = 1.5  # pixels that a match may miss by, as Sampson measures it
 # pixels: features are stored by strips of columns, and within a strip by rows of as many
@@ -33,13 +34,20 @@ def along_lines(
     """
     strips = [_by_strips(at) for at in pixels]
     start = np.cumsum([0, *map(len, pixels)])
-    partner = _along_lines(
+    joined = np.concatenate(
+        [some[order] for some, (order, _, _) in zip(descriptors, strips, strict=True)]
+    )
+    length = np.empty(len(joined), np.float32)
+    in_parts(_measure, len(joined), joined, length)
+    partner = np.empty((len(pairs), int(np.diff(start).max(initial=0))), np.int32)
+    in_parts(
+        _along_lines,
+        len(pairs),
         np.concatenate(
             [at[order] for at, (order, _, _) in zip(pixels, strips, strict=True)]
         ).astype(np.float32),
-        np.concatenate(
-            [some[order] for some, (order, _, _) in zip(descriptors, strips, strict=True)]
-        ),
+        joined,
+        length,
         start,
         np.concatenate([first for _, first, _ in strips]),
         np.cumsum([0, *(len(first) for _, first, _ in strips)]),
@@ -49,6 +57,7 @@ def along_lines(
         BAND,
         RATIO,
         ALIKE,
+        partner,
     )
     by_pair = []
     for (a, b), row in zip(pairs, partner, strict=True):
@@ -68,15 +77,17 @@ def _by_strips(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
 
 
 @kernel
-def _along_lines(pixels, descriptors, start, first, cells, rows, pairs, F, band, ratio, alike):
-    most = 0
-    for view in range(len(start) - 1):
-        most = max(most, start[view + 1] - start[view])
-    length = np.empty(len(descriptors), np.float32)
-    for k in prange(len(descriptors)):
+def _measure(begin, end, descriptors, length):
+    for k in range(begin, end):
         length[k] = np.sqrt(np.float32(max(_product(descriptors[k], descriptors[k]), 1)))
-    partner = np.empty((len(pairs), most), np.int32)
-    for pair in prange(len(pairs)):
+
+
+@kernel
+def _along_lines(
+    begin, end, pixels, descriptors, length, start, first, cells, rows, pairs, F, band, ratio,
+    alike, partner,
+):  # fmt: skip
+    for pair in range(begin, end):
         a, b = pairs[pair]
         _match(
             pixels[start[a] : start[a + 1]], descriptors[start[a] : start[a + 1]],
@@ -85,7 +96,6 @@ def _along_lines(pixels, descriptors, start, first, cells, rows, pairs, F, band,
             length[start[b] : start[b + 1]],
             first[cells[b] : cells[b + 1]], rows[b], F[pair], band, ratio, alike, partner[pair],
         )  # fmt: skip
-    return partner
 
 
 @body

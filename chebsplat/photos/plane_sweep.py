@@ -14,7 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from chebsplat.kernels.jit import kernel, prange
+from chebsplat.kernels.jit import kernel
+from chebsplat.kernels.threads import in_parts
 
 # half widths in pixels: of the patches that are compared, and of the mean over their costs
 WINDOW, SMOOTH = 1, 1
@@ -123,16 +124,16 @@ def agreed(
     rotations, eyes = poses[:, :3, :3].transpose(0, 2, 1), poses[:, :3, 3:]
     to_world = np.concatenate([rotations @ np.linalg.inv(Ks), -rotations @ eyes], 2)
     into = Ks @ poses[:, :3]
-    return np.asarray(
-        _agreed(np.ascontiguousarray(depth, np.float32), to_world, into, others, least)
-    )
+    depth = np.ascontiguousarray(depth, np.float32)
+    result = np.zeros_like(depth)
+    in_parts(_agreed, len(depth), depth, to_world, into, others, least, result)
+    return result
 
 
 @kernel
-def _agreed(depth, to_world, into, others, least):
-    n_views, height, width = depth.shape
-    result = np.zeros_like(depth)
-    for view in prange(n_views):
+def _agreed(first, last, depth, to_world, into, others, least, result):
+    _, height, width = depth.shape
+    for view in range(first, last):
         back = to_world[view]
         for row in range(height):
             for column in range(width):
@@ -164,4 +165,3 @@ def _agreed(depth, to_world, into, others, least):
                         denied += 1
                 if confirmed >= least and denied <= DENIED * confirmed:
                     result[view, row, column] = own * ratios / (1 + confirmed)
-    return result

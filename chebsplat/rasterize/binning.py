@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chebsplat.kernels.jit import inline, kernel, prange, serial
+from chebsplat.kernels.jit import body, kernel, plain, serial
+from chebsplat.kernels.threads import in_parts
 
 TILE = 16
 BANDS = 4  # at most; of tile rows
@@ -35,19 +36,19 @@ class Bins(NamedTuple):
     pair_starts: np.ndarray
 
 
-@inline
+@body
 def _share(part, n):
     """First index of a part of n."""
     return part * n // PARTS
 
 
-@serial
+@plain
 def band_start(band, rows):
     """First tile row of a band."""
     return band * rows // min(BANDS, rows)
 
 
-@inline
+@body
 def _box(means2d, covariances, opacities, i, width, height, boxes):
     """Fill the half-open box of tiles that α ≥ 1/255 may touch, x then y."""
     limit = 2.0 * math.log(255.0 * opacities[i]) + 1e-3  # the cells' own test is exact
@@ -66,7 +67,7 @@ def _box(means2d, covariances, opacities, i, width, height, boxes):
         boxes[i, 2], boxes[i, 3] = int(y0) // TILE, (math.ceil(y1) + TILE - 1) // TILE
 
 
-@inline
+@body
 def _usable(radii, opacities, colors, cell_colors, i):
     """Projected, bright enough, and finite in opacity and in every channel."""
     check = np.float32(0)
@@ -105,13 +106,13 @@ def _sort(index, keys):
 
 
 @kernel
-def _boxes(means2d, covariances, radii, opacities, colors, cell_colors, width, height):
-    """Boxes of tiles i32 [N, 4], all 0 for a Gaussian that touches none."""
-    boxes = np.zeros((len(means2d), 4), np.int32)
-    for i in prange(len(means2d)):
+def _fill_boxes(
+    first, last, means2d, covariances, radii, opacities, colors, cell_colors, width, height, boxes
+):  # fmt: skip
+    """Boxes of tiles i32 [N, 4], all 0 before, of the Gaussians that touch one."""
+    for i in range(first, last):
         if _usable(radii, opacities, colors, cell_colors, i):
             _box(means2d, covariances, opacities, i, width, height, boxes)
-    return boxes
 
 
 @serial
@@ -130,14 +131,10 @@ def _depth_keys(boxes, depths):
 
 
 @kernel
-def _deal(order, boxes, columns, rows):
-    """tile_starts, rank, pair and pair_starts: every Gaussian, in this order, to its tiles."""
-    n, tiles, bands = len(order), columns * rows, min(BANDS, rows)
-    cursors, tile_starts = np.zeros((PARTS, tiles), np.int32), np.zeros(tiles + 1, np.int64)
-    pair_starts, band_of = np.zeros((bands, n + 1), np.int32), np.empty(rows, np.int64)
-    for y in range(rows):
-        band_of[y] = ((y + 1) * bands - 1) // rows  # the last that starts here or before
-    for part in prange(PARTS):
+def _count(first, last, order, boxes, band_of, columns, cursors, pair_starts):
+    """Pairs of each tile by part in `cursors`, and of each Gaussian by band in `pair_starts`."""
+    n = len(order)
+    for part in range(first, last):
         for m in range(_share(part, n), _share(part + 1, n)):
             x0, x1, y0, y1 = (
                 boxes[order[m], 0],
@@ -149,21 +146,31 @@ def _deal(order, boxes, columns, rows):
                 pair_starts[band_of[y], m + 1] += x1 - x0
                 for x in range(x0, x1):
                     cursors[part, y * columns + x] += 1
+
+
+@serial
+def _add_up(cursors, pair_starts, tile_starts):
+    """Numbers of pairs become where each tile's begin, and each Gaussian's in a band."""
     total = np.int32(0)
-    for band in range(bands):
+    for band in range(len(pair_starts)):
         pair_starts[band, 0] = total
-        for m in range(n):
+        for m in range(pair_starts.shape[1] - 1):
             total += pair_starts[band, m + 1]
             pair_starts[band, m + 1] = total
     total = np.int32(0)
-    for tile in range(tiles):
+    for tile in range(cursors.shape[1]):
         for part in range(PARTS):
             count = cursors[part, tile]
             cursors[part, tile] = total
             total += count
         tile_starts[tile + 1] = total
-    rank, pair = np.empty(total, np.int32), np.empty(total, np.int32)
-    for part in prange(PARTS):
+
+
+@kernel
+def _deal(first, last, order, boxes, band_of, columns, pair_starts, cursors, rank, pair):
+    """Rank and pair of every Gaussian, in this order, at its tiles' cursors, which move on."""
+    n = len(order)
+    for part in range(first, last):
         for m in range(_share(part, n), _share(part + 1, n)):
             x0, x1, y0, y1 = (
                 boxes[order[m], 0],
@@ -181,7 +188,6 @@ def _deal(order, boxes, columns, rows):
                     rank[where], pair[where] = m, k
                     cursors[part, y * columns + x] = where + 1
                     k += 1
-    return tile_starts, rank, pair, pair_starts
 
 
 def bin_gaussians(
@@ -194,8 +200,18 @@ def bin_gaussians(
     Choices: the box of the ellipse α ≥ 1/255; a Gaussian that is fainter, or not finite in opacity
       or in any channel, touches nothing. Ties in depth go by index.
     """
-    boxes = _boxes(means2d, covariances, radii, opacities, colors, cell_colors, width, height)
+    boxes = np.zeros((len(means2d), 4), np.int32)
+    in_parts(_fill_boxes, len(boxes), means2d, covariances, radii, opacities, colors, cell_colors,
+             width, height, boxes)  # fmt: skip
     order = _sort(*_depth_keys(boxes, depths))
-    return Bins(
-        order, *_deal(order, boxes, (width + TILE - 1) // TILE, (height + TILE - 1) // TILE)
-    )
+    columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    bands = min(BANDS, rows)
+    band_of = (np.arange(1, rows + 1) * bands - 1) // rows  # the last that starts there or before
+    cursors = np.zeros((PARTS, columns * rows), np.int32)
+    pair_starts = np.zeros((bands, len(order) + 1), np.int32)
+    tile_starts = np.zeros(columns * rows + 1, np.int64)
+    in_parts(_count, PARTS, order, boxes, band_of, columns, cursors, pair_starts)
+    _add_up(cursors, pair_starts, tile_starts)
+    rank, pair = np.empty((2, tile_starts[-1]), np.int32)
+    in_parts(_deal, PARTS, order, boxes, band_of, columns, pair_starts, cursors, rank, pair)
+    return Bins(order, tile_starts, rank, pair, pair_starts)

@@ -18,7 +18,6 @@ from chebsplat.kernels.simd import (
 )
 
 LONG = ir.IntType(64)
-WORKERS = 256  # that take work from a queue: at most as many threads do so at once
 
 
 @intrinsic

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from chebsplat.kernels.jit import inline, lanes
+from chebsplat.kernels.jit import body, lanes, plain
 from chebsplat.kernels.simd import (
     bits,
     fma,
@@ -57,25 +57,25 @@ E0, E1, E2, E3, E4, E5 = (
 )
 
 
-@inline
+@plain
 def padded(channels):
     """Rounded up to fours."""
     return (channels + 3) // 4 * 4
 
 
-@inline
+@plain
 def whole(channels):
     """Rounded up to whole vectors."""
     return (channels + LANES - 1) // LANES * LANES
 
 
-@inline
+@body
 def corner(cell):
     """x and y of a cell's first pixel in its tile."""
     return 4 * (cell & 3), 4 * (cell >> 2)
 
 
-@inline
+@body
 def _larger(a, b):
     return where(a > b, a, b)
 
@@ -122,7 +122,7 @@ def listed(masks, at, n, cell, hits):
     return count
 
 
-@inline
+@body
 def _exp2(power):
     """2^power, for -100 <= power <= 100; anything below."""
     shifted = power + splat(SHIFT)

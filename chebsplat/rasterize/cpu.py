@@ -38,7 +38,8 @@ class _Project(torch.autograd.Function):
         ctx: Any, grad_means2d: Tensor, moments: Tensor, *others: Tensor
     ) -> tuple[Tensor | None, ...]:
         slopes = [g.contiguous().numpy() for g in (grad_means2d, moments, others[-1])]
-        gradients = ellipses.project_adjoint(*ctx.gaussians, *ctx.camera, ctx.radii, *slopes)
+        inputs = [*ctx.gaussians, *ctx.camera, ctx.radii, *slopes]
+        gradients = ellipses.project_adjoint(*inputs)
         return *(torch.from_numpy(a) for a in gradients), None
 
 
@@ -77,8 +78,8 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        slopes = [g.contiguous().numpy() for g in grads]
-        *gradients, finite = tiles_adjoint.backward(*ctx.arrays, *slopes, ctx.absgrad is not None)
+        inputs = [*ctx.arrays, *(g.contiguous().numpy() for g in grads), ctx.absgrad is not None]
+        *gradients, finite = tiles_adjoint.backward(*inputs)
         if not finite:
             raise ValueError(f"the gradient of the image of view {ctx.view} is not finite")
         to_means2d, moments, to_opacities, absolute, *to_channels = (

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from chebsplat.kernels.jit import kernel, prange, serial
+from chebsplat.kernels.jit import kernel, serial
+from chebsplat.kernels.threads import in_every_thread
 from chebsplat.rasterize import cells
 from chebsplat.rasterize.binning import TILE
-from chebsplat.rasterize.blocks import WORKERS, claim
+from chebsplat.rasterize.blocks import claim
 from chebsplat.rasterize.cells import LANES, SHAPE, ZERO
 from chebsplat.rasterize.lift import MAX_ALPHA, binned
 from chebsplat.rasterize.tiles import fill_shapes
@@ -59,19 +60,16 @@ def _depth_tile(splats, ranks, start, stop, left, top, low, high, depth, covered
 
 
 @kernel
-def _depths(splats, tile_starts, ranks, low, high, depth, covered):
+def _depths(queue, splats, tile_starts, ranks, low, high, depth, covered):
     """Fill depth and covered [H, W]."""
-    height, width = depth.shape
-    columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    n_tiles, queue = columns * rows, np.zeros(1, np.int64)
-    for _ in prange(WORKERS):
+    columns = (depth.shape[1] + TILE - 1) // TILE
+    tile = claim(queue)
+    while tile < len(tile_starts) - 1:
+        _depth_tile(
+            splats, ranks, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
+            (tile // columns) * TILE, low, high, depth, covered,
+        )  # fmt: skip
         tile = claim(queue)
-        while tile < n_tiles:
-            _depth_tile(
-                splats, ranks, tile_starts[tile], tile_starts[tile + 1], (tile % columns) * TILE,
-                (tile // columns) * TILE, low, high, depth, covered,
-            )  # fmt: skip
-            tile = claim(queue)
 
 
 def depths(
@@ -102,5 +100,6 @@ def depths(
         np.zeros((height, width), np.float32),
     )
     low, high = (np.float32(bound) for bound in part)
-    _depths(splats, bins.tile_starts, bins.rank, low, high, depth, covered)
+    queue = np.zeros(1, np.int64)
+    in_every_thread(_depths, queue, splats, bins.tile_starts, bins.rank, low, high, depth, covered)
     return depth, covered

@@ -12,16 +12,16 @@ import math
 
 import numpy as np
 
-from chebsplat.kernels.jit import body, inline, kernel, prange
+from chebsplat.kernels.jit import body, kernel
+from chebsplat.kernels.threads import in_parts
 
 HALF_LOG2E = 0.5 * math.log2(math.e)
 LN2 = math.log(2.0)
-PARTS = 64  # of the Gaussians: each has scratch of its own
 # as `projection`'s, which numba's cache could not follow
 LARGEST, EXTENT, LEAST_KEPT = 1e30, 3.33, 0.005
 
 
-@inline
+@body
 def _matmul(a, b, out, rows, inner, columns):
     """The sizes, as literals, let the compiler unroll."""
     for i in range(rows):
@@ -32,7 +32,7 @@ def _matmul(a, b, out, rows, inner, columns):
             out[i, j] = total
 
 
-@inline
+@body
 def _rotation(quat, unit, out):
     """Fill the unit quaternion [4] and its matrix [3, 3]; returns the length of `quat`."""
     largest = max(max(abs(quat[0]), abs(quat[1])), max(abs(quat[2]), abs(quat[3])))
@@ -63,14 +63,14 @@ def _rotation(quat, unit, out):
     return largest * root
 
 
-@inline
+@body
 def _clamped(slope, center, focal, size):
     """The ray's slope, kept within 1.3 fields of view."""
     slack = 0.15 * size / focal
     return min(max(slope, -(center / focal + slack)), (size - center) / focal + slack)
 
 
-@inline
+@body
 def _jacobian(point, viewmat, K, width, height, out, jacobian):
     """Fill `out` [3], the camera-space point, and `jacobian` [2, 3] of the pixel, clamped."""
     for i in range(3):
@@ -84,7 +84,7 @@ def _jacobian(point, viewmat, K, width, height, out, jacobian):
     jacobian[1, 2] = -K[1, 1] * near * _clamped(out[1] * near, K[1, 2], K[1, 1], height)
 
 
-@inline
+@body
 def _squared(jacobian):
     """Sum of squares of a [2, 3]."""
     total = 0.0
@@ -94,7 +94,7 @@ def _squared(jacobian):
     return total
 
 
-@inline
+@body
 def _cross(a, b, out):
     out[0], out[1], out[2] = (
         a[1] * b[2] - a[2] * b[1],
@@ -103,7 +103,7 @@ def _cross(a, b, out):
     )
 
 
-@inline
+@body
 def _ellipse(factor, eps2d, cross):
     """F Fᵀ + ε I: xx, xy, yy, determinant by Cauchy-Binet, |f × g|; fills `cross` with f × g."""
     a = b = c = 0.0
@@ -117,10 +117,10 @@ def _ellipse(factor, eps2d, cross):
     return a + eps2d, b, c + eps2d, determinant, math.sqrt(area)
 
 
-@body
+@kernel
 def _project(
-    means, quats, scales, viewmat, turn, K, width, height, near_plane, far_plane, eps2d,
-    first, last, means2d, covariances, whitening, conics, depths, radii, compensations,
+    first, last, means, quats, scales, viewmat, turn, K, width, height, near_plane, far_plane,
+    eps2d, means2d, covariances, whitening, conics, depths, radii, compensations,
 ):  # fmt: skip
     """`project` of the Gaussians from `first` up to `last`, into what it returns."""
     unit, camera, cross = np.empty(4), np.empty(3), np.empty(3)
@@ -176,8 +176,9 @@ def _project(
         )
 
 
-@kernel
-def project(means, quats, scales, viewmat, K, width, height, near_plane, far_plane, eps2d):
+def project(
+    means, quats, scales, viewmat, K, width, height, near_plane, far_plane, eps2d,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
     """Ellipses of one view.
 
     Args: means, scales [N, 3], quats [N, 4] float32; viewmat [4, 4], K [3, 3] float64.
@@ -186,37 +187,18 @@ def project(means, quats, scales, viewmat, K, width, height, near_plane, far_pla
       ε I)), at least LEAST_KEPT. Rows of culled Gaussians are zero; a visible one's radius is not.
     """
     n = len(means)
-    means2d, covariances = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
-    whitening, conics = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
-    depths, radii, compensations = (
-        np.zeros(n, np.float32),
-        np.zeros(n, np.int32),
-        np.zeros(n, np.float32),
+    widths = 2, 3, 3, 3  # of means2d, covariances, whitening, conics
+    out = (
+        *(np.zeros((n, columns), np.float32) for columns in widths),
+        *(np.zeros(n, kind) for kind in (np.float32, np.int32, np.float32)),
     )
     turn = np.ascontiguousarray(viewmat[:3, :3])
-    out = means2d, covariances, whitening, conics, depths, radii, compensations
-    for part in prange(PARTS):
-        first, last = part * n // PARTS, (part + 1) * n // PARTS
-        _project(
-            means,
-            quats,
-            scales,
-            viewmat,
-            turn,
-            K,
-            width,
-            height,
-            near_plane,
-            far_plane,
-            eps2d,
-            first,
-            last,
-            *out,
-        )
+    in_parts(_project, n, means, quats, scales, viewmat, turn, K, width, height, near_plane,
+             far_plane, eps2d, *out)  # fmt: skip
     return out
 
 
-@inline
+@body
 def _rotation_adjoint(unit, length, by, out):
     """Gradient [4] to a quaternion of this length from that to its matrix [3, 3]."""
     w, x, y, z = unit[0], unit[1], unit[2], unit[3]
@@ -246,10 +228,10 @@ def _rotation_adjoint(unit, length, by, out):
         out[k] = (out[k] - along * unit[k]) * shrink
 
 
-@body
+@kernel
 def _project_adjoint(
-    means, quats, scales, viewmat, turn, K, width, height, eps2d, radii, grad_means2d,
-    moments, grad_compensations, first, last, to_means, to_quats, to_scales,
+    first, last, means, quats, scales, viewmat, turn, K, width, height, eps2d, radii,
+    grad_means2d, moments, grad_compensations, to_means, to_quats, to_scales,
 ):  # fmt: skip
     """`project_adjoint` of the Gaussians from `first` up to `last`, into what it returns.
 
@@ -328,21 +310,10 @@ def _project_adjoint(
             to_quats[i, k] = by_quat[k]
 
 
-@kernel
 def project_adjoint(
-    means,
-    quats,
-    scales,
-    viewmat,
-    K,
-    width,
-    height,
-    eps2d,
-    radii,
-    grad_means2d,
-    moments,
+    means, quats, scales, viewmat, K, width, height, eps2d, radii, grad_means2d, moments,
     grad_compensations,
-):
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Gradients [N, 3], [N, 4], [N, 3] to means, quats and scales; zero rows where culled.
 
     Args: grad_means2d [N, 2]; moments [N, 3]: uu, uv, vv of Σ g (W d)(W d)ᵀ over a Gaussian's
@@ -352,10 +323,7 @@ def project_adjoint(
     to_means, to_scales = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
     to_quats = np.zeros((n, 4), np.float32)
     turn = np.ascontiguousarray(viewmat[:3, :3])
-    for part in prange(PARTS):
-        first, last = part * n // PARTS, (part + 1) * n // PARTS
-        _project_adjoint(
-            means, quats, scales, viewmat, turn, K, width, height, eps2d, radii, grad_means2d,
-            moments, grad_compensations, first, last, to_means, to_quats, to_scales,
-        )  # fmt: skip
+    in_parts(_project_adjoint, n, means, quats, scales, viewmat, turn, K, width, height, eps2d,
+             radii, grad_means2d, moments, grad_compensations, to_means, to_quats, to_scales,
+    )  # fmt: skip
     return to_means, to_quats, to_scales

@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from chebsplat.kernels.jit import kernel, lanes, prange, serial
+from chebsplat.kernels.jit import kernel, lanes, serial
 from chebsplat.kernels.simd import load, splat, store, where
+from chebsplat.kernels.threads import in_every_thread, in_parts
 from chebsplat.rasterize import binning, cell_adjoint, cells, ellipses, tiles
 from chebsplat.rasterize.binning import TILE, band_start
-from chebsplat.rasterize.blocks import WORKERS, claim
+from chebsplat.rasterize.blocks import claim
 from chebsplat.rasterize.cells import LANES, SHAPE, ZERO
 from chebsplat.rasterize.tiles import fill_shapes
 
@@ -75,36 +76,48 @@ def _lift_tile(
 
 
 @kernel
+def _fill_records(
+    queue, last_tile, base, splats, tile_starts, ranks, pair, values, counts, width, height, gate,
+    records,
+):  # fmt: skip
+    """Records of a band's pairs, the first of which is `base`; see `_lift_tile`."""
+    columns = (width + TILE - 1) // TILE
+    tile = claim(queue)
+    while tile < last_tile:
+        for k in range(tile_starts[tile], tile_starts[tile + 1]):
+            cell_adjoint.clear(records, pair[k] - base)
+        _lift_tile(
+            splats, ranks, pair, tile_starts[tile], tile_starts[tile + 1],
+            (tile % columns) * TILE, (tile // columns) * TILE, width, height,
+            values, counts, gate, base, records,
+        )  # fmt: skip
+        tile = claim(queue)
+
+
+@kernel
+def _add_records(first, last, records, starts, sums):
+    """Add the records of a band, `starts` [V + 1] of which are a Gaussian's, in their order."""
+    for m in range(first, last):
+        for k in range(starts[m] - starts[0], starts[m + 1] - starts[0]):
+            cell_adjoint.add_means(records, k, 0, sums, m)
+
+
 def _lift(
-    splats, n_visible, tile_starts, ranks, pair, pair_starts, values, counts, width, height, gate
-):
-    """Sums f32 [n_visible, E] by rank of values [cells, E], E in sixteens; count 0: left out."""
+    splats: np.ndarray, bins: binning.Bins, values: np.ndarray, counts: np.ndarray, width: int,
+    height: int, gate: np.float32,
+) -> np.ndarray:  # fmt: skip
+    """Sums f32 [V, E] by rank of values [cells, E], E in sixteens; count 0: left out."""
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    bands, room = len(pair_starts), 0
-    for band in range(bands):
-        room = max(room, pair_starts[band, n_visible] - pair_starts[band, 0])
-    records, sums = (
-        np.empty((room, values.shape[1]), np.float32),
-        np.zeros((n_visible, values.shape[1]), np.float32),
-    )
-    for band in range(bands):
-        first_tile, base = band_start(band, rows) * columns, pair_starts[band, 0]
-        n_tiles = band_start(band + 1, rows) * columns - first_tile
-        queue = np.full(1, first_tile, np.int64)
-        for _ in prange(WORKERS):
-            tile = claim(queue)
-            while tile < first_tile + n_tiles:
-                for k in range(tile_starts[tile], tile_starts[tile + 1]):
-                    cell_adjoint.clear(records, pair[k] - base)
-                _lift_tile(
-                    splats, ranks, pair, tile_starts[tile], tile_starts[tile + 1],
-                    (tile % columns) * TILE, (tile // columns) * TILE, width, height,
-                    values, counts, gate, base, records,
-                )  # fmt: skip
-                tile = claim(queue)
-        for m in prange(n_visible):
-            for k in range(pair_starts[band, m] - base, pair_starts[band, m + 1] - base):
-                cell_adjoint.add_means(records, k, 0, sums, m)
+    room = int(np.ptp(bins.pair_starts[:, [0, -1]], axis=1).max())
+    records = np.empty((room, values.shape[1]), np.float32)
+    sums = np.zeros((len(bins.order), values.shape[1]), np.float32)
+    for band, starts in enumerate(bins.pair_starts):
+        first, last = (band_start(k, rows) * columns for k in (band, band + 1))
+        in_every_thread(
+            _fill_records, np.full(1, first), last, int(starts[0]), splats, bins.tile_starts,
+            bins.rank, bins.pair, values, counts, width, height, gate, records,
+        )  # fmt: skip
+        in_parts(_add_records, len(sums), records, starts, sums)
     return sums
 
 
@@ -117,8 +130,8 @@ def binned(
 ) -> tuple[binning.Bins, np.ndarray]:
     """The Gaussians that a view shows, by tile, and packed with channels f32 [N, C]; see `lift`."""
     means, quats, scales, opacities = gaussians
-    camera = (np.ascontiguousarray(matrix, np.float64) for matrix in (viewmat, K))
-    projected = ellipses.project(means, quats, scales, *camera, *size, NEAR, FAR, EPS2D)
+    viewmat, K = (np.ascontiguousarray(matrix, np.float64) for matrix in (viewmat, K))
+    projected = ellipses.project(means, quats, scales, viewmat, K, *size, NEAR, FAR, EPS2D)
     means2d, covariances, whitening, _, depths, radii, _ = projected
     none = np.zeros((len(means), 0), np.float32)
     bins = binning.bin_gaussians(means2d, covariances, depths, radii, opacities, none, none, *size)
@@ -162,17 +175,14 @@ def lift(
         )
     n_channels = values.shape[2]
     counted = counts > 0
-    weighted = np.zeros((*shape, int(cells.whole(n_channels + 1))), np.float32)
+    weighted = np.zeros((*shape, cells.whole(n_channels + 1)), np.float32)
     weighted[counted, :n_channels] = values[counted] * counts[counted][:, None]
     weighted[counted, n_channels] = counts[counted]
     if not (np.isfinite(weighted).all() and np.isfinite(counts).all()):
         raise ValueError("a cell that counts holds a value that is not finite")
     bins, splats = binned(gaussians, viewmat, K, size)
-    sums = _lift(
-        splats, len(bins.order), bins.tile_starts, bins.rank, bins.pair, bins.pair_starts,
-        weighted.reshape(-1, weighted.shape[2]), counted.astype(np.float32),
-        width, height, np.float32(gate),
-    )  # fmt: skip
+    flat = weighted.reshape(-1, weighted.shape[2])
+    sums = _lift(splats, bins, flat, counted.astype(np.float32), width, height, np.float32(gate))
     rows = np.flatnonzero(sums[:, n_channels] > 0)
     rows = rows[np.argsort(bins.order[rows])]
     sums = sums[rows]

@@ -15,32 +15,27 @@ import math
 
 import numpy as np
 
-from chebsplat.kernels.jit import inline, kernel, prange, serial
+from chebsplat.kernels.jit import kernel, plain, serial
+from chebsplat.kernels.threads import in_every_thread, in_parts
 from chebsplat.rasterize import cells
 from chebsplat.rasterize.binning import TILE
-from chebsplat.rasterize.blocks import WORKERS, claim, from_lanes, prefetch
+from chebsplat.rasterize.blocks import claim, from_lanes, prefetch
 from chebsplat.rasterize.cells import LANES, ONE, SHAPE, SLACK
 
 AHEAD_OF_CACHE = 16  # rows between asking for one and using it
 CHUNK = 128  # Gaussians of a tile between two looks at whether it is done
 
 
-@inline
+@plain
 def cell_column(channels):
     """First column of a splat's cell channels, behind its shape, its channels and alpha's 1."""
     return cells.whole(SHAPE + channels + 1)
 
 
 @kernel
-def pack(order, means2d, whitening, opacities, colors, cell_colors):
-    """Rows of whole cache lines that the tiles read, one for each Gaussian, front to back.
-
-    Returns: splats [V + 1, S]: mean, whitening, log₂ opacity, two unused, the channels, a 1 for
-      alpha, zeros, and from `cell_column` on the cell channels and zeros.
-    """
+def _pack(first, last, order, means2d, whitening, opacities, colors, cell_colors, splats):
     channels, column = colors.shape[1], cell_column(colors.shape[1])
-    splats = np.zeros((len(order) + 1, column + cells.whole(cell_colors.shape[1])), np.float32)
-    for m in prange(len(order)):
+    for m in range(first, last):
         i = order[m]
         splats[m, 0], splats[m, 1] = means2d[i, 0], means2d[i, 1]
         splats[m, 2], splats[m, 3], splats[m, 4] = whitening[i, 0], whitening[i, 1], whitening[i, 2]
@@ -50,6 +45,17 @@ def pack(order, means2d, whitening, opacities, colors, cell_colors):
         splats[m, SHAPE + channels] = ONE
         for d in range(cell_colors.shape[1]):
             splats[m, column + d] = cell_colors[i, d]
+
+
+def pack(order, means2d, whitening, opacities, colors, cell_colors) -> np.ndarray:
+    """Rows of whole cache lines that the tiles read, one for each Gaussian, front to back.
+
+    Returns: splats [V + 1, S]: mean, whitening, log₂ opacity, two unused, the channels, a 1 for
+      alpha, zeros, and from `cell_column` on the cell channels and zeros.
+    """
+    width = cell_column(colors.shape[1]) + cells.whole(cell_colors.shape[1])
+    splats = np.zeros((len(order) + 1, width), np.float32)
+    in_parts(_pack, len(order), order, means2d, whitening, opacities, colors, cell_colors, splats)
     return splats
 
 
@@ -143,27 +149,38 @@ def _forward_tile(
 
 
 @kernel
-def forward(splats, tile_starts, ranks, channels, cell_channels, width, height, max_alpha):
+def _forward(
+    queue, splats, tile_starts, ranks, channels, width, height, max_alpha, masks, used, render,
+    means, transmittance,
+):  # fmt: skip
+    columns, n_tiles = (width + TILE - 1) // TILE, len(used)
+    tile = claim(queue)
+    while tile < n_tiles:
+        used[tile] = _forward_tile(
+            splats, ranks, tile_starts[tile], tile_starts[tile + 1],
+            (tile % columns) * TILE, (tile // columns) * TILE, width, height, channels,
+            max_alpha, masks, render, means, transmittance,
+        )  # fmt: skip
+        tile = claim(queue)
+
+
+def forward(
+    splats, tile_starts, ranks, channels, cell_channels, width, height, max_alpha,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
     """Composite front to back the splats of `pack`, listed by `binning.bin_gaussians`.
 
     Returns: render [H, W, D], means [⌈H/4⌉, ⌈W/4⌉, E] over the cells, transmittance [H, W]; masks
       u16 [P + 16] of the cells each pair may reach, and used [tiles], the pairs that were looked at
       before all pixels were done: for `backward`.
     """
-    columns, n_tiles = (width + TILE - 1) // TILE, len(tile_starts) - 1
     render = np.empty(height * width * channels, np.float32)
     means = np.empty(((height + 3) // 4, (width + 3) // 4, cell_channels), np.float32)
     transmittance = np.empty(height * width, np.float32)
-    masks, used = np.empty(len(ranks) + LANES, np.uint16), np.zeros(n_tiles, np.int64)
-    queue = np.zeros(1, np.int64)
-    for _ in prange(WORKERS):
-        tile = claim(queue)
-        while tile < n_tiles:
-            used[tile] = _forward_tile(
-                splats, ranks, tile_starts[tile], tile_starts[tile + 1],
-                (tile % columns) * TILE, (tile // columns) * TILE, width, height, channels,
-                max_alpha, masks, render, means, transmittance,
-            )  # fmt: skip
-            tile = claim(queue)
+    masks = np.empty(len(ranks) + LANES, np.uint16)
+    used = np.zeros(len(tile_starts) - 1, np.int64)
+    in_every_thread(
+        _forward, np.zeros(1, np.int64), splats, tile_starts, ranks, channels, width, height,
+        max_alpha, masks, used, render, means, transmittance,
+    )  # fmt: skip
     shape = height, width
     return render.reshape((*shape, channels)), means, transmittance.reshape(shape), masks, used

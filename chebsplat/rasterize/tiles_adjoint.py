@@ -9,10 +9,11 @@ import math
 
 import numpy as np
 
-from chebsplat.kernels.jit import kernel, prange, serial
+from chebsplat.kernels.jit import kernel, serial
+from chebsplat.kernels.threads import in_every_thread, in_parts
 from chebsplat.rasterize import cell_adjoint, cells
 from chebsplat.rasterize.binning import TILE, band_start
-from chebsplat.rasterize.blocks import WORKERS, claim, prefetch, to_lanes
+from chebsplat.rasterize.blocks import claim, prefetch, to_lanes
 from chebsplat.rasterize.cells import BLOCK, LANES, N_GEOMETRY, SHAPE, SLACK
 from chebsplat.rasterize.tiles import AHEAD_OF_CACHE, cell_column, fill_shapes, n_pixels_inside
 
@@ -102,9 +103,59 @@ def _backward_tile(
 
 
 @kernel
+def _fill_records(
+    queue, first_tile, last_tile, base, n_pairs, splats, tile_starts, ranks, pair, masks, used,
+    max_alpha, width, height, channels, grad, grad_means, grad_alpha, absolute, records, finite,
+):  # fmt: skip
+    """Records of a band's pairs, the first of which is `base`; see `_backward_tile`."""
+    columns = (width + TILE - 1) // TILE
+    tile = claim(queue)
+    while tile < last_tile:
+        for k in range(tile_starts[tile], tile_starts[tile + 1]):
+            cell_adjoint.clear(records, pair[k] - base)
+        finite[tile] = _backward_tile(
+            splats, ranks, pair, masks, tile_starts[tile], used[tile],
+            (tile % columns) * TILE, (tile // columns) * TILE, width, height, channels,
+            max_alpha, grad, grad_means, grad_alpha, absolute, base,
+            n_pairs + tile - first_tile, records,
+        )  # fmt: skip
+        tile = claim(queue)
+
+
+@kernel
+def _add_records(first, last, records, starts, order, channels, sums, to_colors, to_cell_colors):
+    """Add the records of a band, `starts` [V + 1] of which are a Gaussian's, in their order."""
+    base, column = starts[0], N_GEOMETRY + cells.padded(channels)
+    for m in range(first, last):
+        following = np.int64(order[min(m + AHEAD_OF_CACHE, len(order) - 1)]) * channels
+        prefetch(to_colors, following)
+        prefetch(to_colors, following + channels - 1)
+        for k in range(starts[m] - base, starts[m + 1] - base):
+            for d in range(N_GEOMETRY):
+                sums[m, d] += records[k, d]
+            for d in range(channels):
+                to_colors[order[m], d] += records[k, N_GEOMETRY + d]
+            cell_adjoint.add_means(records, k, column, to_cell_colors, order[m])
+
+
+@kernel
+def _to_ellipses(
+    first, last, splats, order, sums, to_means2d, moments, to_opacities, to_absolute
+):  # fmt: skip
+    """Gradients to a Gaussian's ellipse from its sums."""
+    for m in range(first, last):
+        i, p, q, r = order[m], splats[m, 2], splats[m, 3], splats[m, 4]
+        to_means2d[i, 0] = 2 * p * sums[m, 1]
+        to_means2d[i, 1] = 2 * (q * sums[m, 1] + r * sums[m, 2])
+        moments[i, 0], moments[i, 1], moments[i, 2] = sums[m, 3], sums[m, 4], sums[m, 5]
+        to_opacities[i] = sums[m, 0] * 2.0 ** (-splats[m, 5]) / math.log(2.0)
+        if len(to_absolute) > 0:
+            to_absolute[i, 0], to_absolute[i, 1] = sums[m, 6], sums[m, 7]
+
+
 def backward(
-    n, splats, order, tile_starts, ranks, pair, pair_starts, masks, used, max_alpha,
-    grad, grad_means, grad_alpha, absolute,
+    n, splats, order, tile_starts, ranks, pair, pair_starts, masks, used, max_alpha, grad,
+    grad_means, grad_alpha, absolute,
 ):  # fmt: skip
     """Gradients of n Gaussians, band by band, each Gaussian's records summed in order of its pairs.
 
@@ -117,64 +168,35 @@ def backward(
     height, width, channels = grad.shape
     flat, flat_alpha = grad.reshape(-1), grad_alpha.reshape(-1)
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    finite, bands, n_visible = np.ones(len(tile_starts) - 1, np.bool_), len(pair_starts), len(order)
-    room = 0
-    for band in range(bands):
-        n_tiles = (band_start(band + 1, rows) - band_start(band, rows)) * columns
-        room = max(room, pair_starts[band, n_visible] - pair_starts[band, 0] + n_tiles)
-    cell_channels, column = grad_means.shape[2], N_GEOMETRY + cells.padded(channels)
-    records = np.empty((room, column + cells.whole(cell_channels)), np.float32)
-    sums, to_colors = (
-        np.zeros((n_visible, N_GEOMETRY), np.float32),
-        np.zeros((n, channels), np.float32),
-    )
-    to_cell_colors = np.zeros((n, cells.whole(cell_channels)), np.float32)
-    for band in range(bands):
-        first_tile = band_start(band, rows) * columns
-        n_tiles = band_start(band + 1, rows) * columns - first_tile
-        base, n_pairs = pair_starts[band, 0], pair_starts[band, n_visible] - pair_starts[band, 0]
-        queue = np.full(1, first_tile, np.int64)
-        for _ in prange(WORKERS):
-            tile = claim(queue)
-            while tile < first_tile + n_tiles:
-                for k in range(tile_starts[tile], tile_starts[tile + 1]):
-                    cell_adjoint.clear(records, pair[k] - base)
-                finite[tile] = _backward_tile(
-                    splats, ranks, pair, masks, tile_starts[tile], used[tile],
-                    (tile % columns) * TILE, (tile // columns) * TILE, width, height, channels,
-                    max_alpha, flat, grad_means, flat_alpha, absolute, base,
-                    n_pairs + tile - first_tile, records,
-                )  # fmt: skip
-                tile = claim(queue)
-        for m in prange(n_visible):
-            following = np.int64(order[min(m + AHEAD_OF_CACHE, n_visible - 1)]) * channels
-            prefetch(to_colors, following)
-            prefetch(to_colors, following + channels - 1)
-            for k in range(pair_starts[band, m] - base, pair_starts[band, m + 1] - base):
-                for d in range(N_GEOMETRY):
-                    sums[m, d] += records[k, d]
-                for d in range(channels):
-                    to_colors[order[m], d] += records[k, N_GEOMETRY + d]
-                cell_adjoint.add_means(records, k, column, to_cell_colors, order[m])
+    finite, bands = np.ones(len(tile_starts) - 1, np.bool_), len(pair_starts)
+    tiles = [band_start(band, rows) * columns for band in range(bands + 1)]
+    n_pairs = np.ptp(pair_starts[:, [0, -1]], axis=1).astype(np.int64)
+    column = N_GEOMETRY + cells.padded(channels)
+    cell_columns = cells.whole(grad_means.shape[2])
+    room = int((n_pairs + np.diff(tiles)).max())
+    records = np.empty((room, column + cell_columns), np.float32)
+    sums = np.zeros((len(order), N_GEOMETRY), np.float32)
+    to_colors = np.zeros((n, channels), np.float32)
+    to_cell_colors = np.zeros((n, cell_columns), np.float32)
+    for band, starts in enumerate(pair_starts):
+        in_every_thread(
+            _fill_records, np.full(1, tiles[band]), tiles[band], tiles[band + 1], int(starts[0]),
+            int(n_pairs[band]), splats, tile_starts, ranks, pair, masks, used, max_alpha, width,
+            height, channels, flat, grad_means, flat_alpha, absolute, records, finite,
+        )  # fmt: skip
+        in_parts(_add_records, len(order), records, starts, order, channels, sums, to_colors,
+                 to_cell_colors)  # fmt: skip
     to_means2d, moments = np.zeros((n, 2), np.float32), np.zeros((n, 3), np.float32)
-    to_opacities, to_absolute = (
-        np.zeros(n, np.float32),
-        np.zeros((n if absolute else 0, 2), np.float32),
-    )
-    for m in prange(n_visible):
-        i, p, q, r = order[m], splats[m, 2], splats[m, 3], splats[m, 4]
-        to_means2d[i, 0] = 2 * p * sums[m, 1]
-        to_means2d[i, 1] = 2 * (q * sums[m, 1] + r * sums[m, 2])
-        moments[i, 0], moments[i, 1], moments[i, 2] = sums[m, 3], sums[m, 4], sums[m, 5]
-        to_opacities[i] = sums[m, 0] * 2.0 ** (-splats[m, 5]) / math.log(2.0)
-        if absolute:
-            to_absolute[i, 0], to_absolute[i, 1] = sums[m, 6], sums[m, 7]
+    to_opacities = np.zeros(n, np.float32)
+    to_absolute = np.zeros((n if absolute else 0, 2), np.float32)
+    in_parts(_to_ellipses, len(order), splats, order, sums, to_means2d, moments, to_opacities,
+             to_absolute)  # fmt: skip
     return (
         to_means2d,
         moments,
         to_opacities,
         to_absolute,
         to_colors,
-        to_cell_colors[:, :cell_channels],
-        finite.all(),
+        to_cell_colors[:, : grad_means.shape[2]],
+        bool(finite.all()),
     )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from chebsplat.kernels.threads import in_parts
 from chebsplat.settings import DescribeSection
 from chebsplat.shape import descriptor_kernel
 from chebsplat.shape.described import Described, Descriptor
@@ -125,7 +126,6 @@ def _compiled(
     out = np.zeros((*mask.shape, n_angles, max_degree - 1), np.float32)
     exact = np.zeros(len(mask), np.bool_)
     parts = [np.ascontiguousarray(v, np.float64) for v in (means, scales, rotmats)]
-    descriptor_kernel.describe(
-        *parts, np.ascontiguousarray(mask), float(anisotropy), float(bandwidth), out, exact
-    )
+    in_parts(descriptor_kernel.describe, len(mask), *parts, np.ascontiguousarray(mask),
+             float(anisotropy), float(bandwidth), out, exact)  # fmt: skip
     return out, int(exact.sum())

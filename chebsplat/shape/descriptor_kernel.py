@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from chebsplat.kernels.jit import kernel, prange, serial
+from chebsplat.kernels.jit import kernel, serial
 from chebsplat.kernels.simd import fma, load, splat, spread, store
 from chebsplat.shape.albo_kernel import (
     LEAST_BANDWIDTH,
@@ -19,7 +19,6 @@ from chebsplat.shape.albo_kernel import (
 )
 from chebsplat.shape.region_frame import canonical, metric, tangent_axis, turn_back
 
-BLOCK = 8  # regions that share scratch memory
 FINEST = np.float32(-0.5 / LEAST_BANDWIDTH**2 / math.log(2.0))
 ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 
@@ -110,9 +109,14 @@ def pair_angles(values, certainty, index, count, n, out):
                 out[index[i], j, d] = value
 
 
-@serial
-def describe_block(first, last, means, scales, rotmats, mask, anisotropy, bandwidth, out, exact):
-    """Regions first...last − 1, one after the other, in scratch memory of their own."""
+@kernel
+def describe(first, last, means, scales, rotmats, mask, anisotropy, bandwidth, out, exact):
+    """Descriptors of regions first...last − 1 into out f32 [M, n, J, D - 1]; exact [M]: took the
+    float64 operator.
+
+    Args: float64 means, scales [M, n, 3], rotmats [M, n, 3, 3]; mask [M, n] bool; out and exact
+      zero.
+    """
     size, n_angles, max_degree = mask.shape[1], out.shape[2], out.shape[3] + 1
     widest = (size + 15) // 16 * 16
     scale = np.float32(-0.5 / bandwidth**2 / math.log(2.0))
@@ -152,16 +156,3 @@ def describe_block(first, last, means, scales, rotmats, mask, anisotropy, bandwi
                 exact[r] = True
             diagonals(terms, u, max_degree, count, n, values[j])
         pair_angles(values, certainty, index, count, n, out[r])
-
-
-@kernel
-def describe(means, scales, rotmats, mask, anisotropy, bandwidth, out, exact):
-    """Descriptors of regions into out f32 [M, n, J, D - 1]; exact [M]: took the float64 operator.
-
-    Args: float64 means, scales [M, n, 3], rotmats [M, n, 3, 3]; mask [M, n] bool; out and exact
-      zero.
-    """
-    m = len(mask)
-    for block in prange((m + BLOCK - 1) // BLOCK):
-        first, last = block * BLOCK, min((block + 1) * BLOCK, m)
-        describe_block(first, last, means, scales, rotmats, mask, anisotropy, bandwidth, out, exact)

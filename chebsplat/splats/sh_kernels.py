@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from chebsplat.kernels.jit import body, kernel, prange
+from chebsplat.kernels.jit import body, kernel
+from chebsplat.kernels.threads import in_parts
 
 
 @body
@@ -59,10 +60,10 @@ def _band(values, first, band, i, c):
 
 
 @kernel
-def _forward(sh0, sh1, sh2, sh3, bands, index, means, eye, degree):
-    out, n_held = np.empty((len(index), 3), np.float32), (len(sh1), len(sh2), len(sh3))
-    for v in prange(len(index)):
-        i, values = index[v], np.empty(16)
+def _forward(first, last, sh0, sh1, sh2, sh3, bands, index, means, eye, degree, out):
+    n_held, values = (len(sh1), len(sh2), len(sh3)), np.empty(16)
+    for v in range(first, last):
+        i = index[v]
         top = _top_band(bands, n_held, i, v, degree)
         _basis(means, eye, i, top, values)
         for c in range(3):
@@ -74,7 +75,6 @@ def _forward(sh0, sh1, sh2, sh3, bands, index, means, eye, degree):
             if top >= 3:
                 total += _band(values, 9, sh3, i, c)
             out[v, c] = max(total, 0.0)
-    return out
 
 
 @body
@@ -83,30 +83,15 @@ def _to_band(values, first, g, out, i, c):
         out[i, k, c] = values[first + k] * g
 
 
-@body
-def _clear(out, i):
-    for k in range(out.shape[1]):
-        for c in range(3):
-            out[i, k, c] = np.float32(0)
-
-
 @kernel
-def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_bands):
+def _backward(
+    first, last, sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_bands,
+    to_sh0, to_sh1, to_sh2, to_sh3, to_bands,
+):  # fmt: skip
     """Gradients to sh0, each band and, if asked for, the masks [V, 3], closed ones included."""
-    n, n_held = len(means), (len(sh1), len(sh2), len(sh3))
-    to_sh0, to_sh1 = np.empty((n, 1, 3), np.float32), np.empty(sh1.shape, np.float32)
-    to_sh2, to_sh3 = np.empty(sh2.shape, np.float32), np.empty(sh3.shape, np.float32)
-    to_bands = np.zeros((len(index) if for_bands else 0, 3), np.float32)
-    for i in prange(n):
-        _clear(to_sh0, i)
-        if i < n_held[0]:
-            _clear(to_sh1, i)
-        if i < n_held[1]:
-            _clear(to_sh2, i)
-        if i < n_held[2]:
-            _clear(to_sh3, i)
-    for v in prange(len(index)):
-        i, values = index[v], np.empty(16)
+    n_held, values = (len(sh1), len(sh2), len(sh3)), np.empty(16)
+    for v in range(first, last):
+        i = index[v]
         top = _top_band(bands, n_held, i, v, degree)
         _basis(means, eye, i, degree if for_bands else top, values)
         for c in range(3):
@@ -124,7 +109,6 @@ def _backward(sh1, sh2, sh3, bands, index, means, eye, degree, out, grad, for_ba
                 to_bands[v, 1] += _band(values, 4, sh2, i, c) * g
             if for_bands and degree >= 3 and i < n_held[2]:
                 to_bands[v, 2] += _band(values, 9, sh3, i, c) * g
-    return to_sh0, to_sh1, to_sh2, to_sh3, to_bands
 
 
 class _Colors(torch.autograd.Function):
@@ -133,16 +117,20 @@ class _Colors(torch.autograd.Function):
         arrays = [
             t.detach().contiguous().numpy() for t in (sh0, sh1, sh2, sh3, masks, index, means, eye)
         ]
-        out = _forward(*arrays, degree)
+        out = np.empty((len(index), 3), np.float32)
+        in_parts(_forward, len(out), *arrays, degree, out)
         ctx.arrays, ctx.degree, ctx.out = arrays, degree, out
         return torch.from_numpy(out)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         for_bands = ctx.needs_input_grad[4]
-        gradients = _backward(
-            *ctx.arrays[1:], ctx.degree, ctx.out, grad.contiguous().numpy(), for_bands
-        )
+        gradients = [np.zeros(band.shape, np.float32) for band in ctx.arrays[:4]]
+        gradients.append(np.zeros((len(grad) if for_bands else 0, 3), np.float32))
+        in_parts(
+            _backward, len(grad), *ctx.arrays[1:], ctx.degree, ctx.out, grad.contiguous().numpy(),
+            for_bands, *gradients,
+        )  # fmt: skip
         parts = [torch.from_numpy(a) for a in gradients]
         return *parts[:4], parts[4] if for_bands else None, None, None, None, None
 

@@ -11,7 +11,8 @@ import math
 
 import numpy as np
 
-from chebsplat.kernels.jit import inline, kernel, prange
+from chebsplat.kernels.jit import body, kernel
+from chebsplat.kernels.threads import in_parts
 
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = np.float32(0.01**2), np.float32(0.03**2)
@@ -24,11 +25,10 @@ TINY = np.float32(1e-12)
 
 
 @kernel
-def _blur_products(a, b):
+def _blur_products(first, last, a, b, out):
     """Horizontal blur of a, b, a², b², ab: [H, L] twice -> [H, 5, L], zero beyond the border."""
-    height, length = a.shape
-    out = np.zeros((height, 5, length), np.float32)
-    for y in prange(height):
+    length = a.shape[1]
+    for y in range(first, last):
         row = np.zeros((5, length + 6 * HALF), np.float32)
         for x in range(length):
             u, v = a[y, x], b[y, x]
@@ -39,10 +39,9 @@ def _blur_products(a, b):
                 tap = TAPS[t]
                 for x in range(length):
                     out[y, k, x] += tap * row[k, x + 3 * t]
-    return out
 
 
-@inline
+@body
 def _sum(terms):
     """In order, apart from the loop that makes them: that one vectorises then."""
     total = 0.0
@@ -52,12 +51,10 @@ def _sum(terms):
 
 
 @kernel
-def _compare(blurred, weight):
+def _compare(first, last, blurred, weight, values, slopes):
     """SSIM by row, under a weight [H, L]; derivatives [H, 3, L] to mean, variance, covariance."""
     height, _, length = blurred.shape
-    values = np.zeros(height, np.float64)
-    slopes = np.zeros((height, 3, length), np.float32)
-    for y in prange(height):
+    for y in range(first, last):
         m, terms = np.zeros((5, length), np.float32), np.empty(length, np.float32)
         for t in range(max(0, HALF - y), min(WINDOW, height + HALF - y)):
             tap = TAPS[t]
@@ -81,15 +78,13 @@ def _compare(blurred, weight):
             slopes[y, 0, x] = by_mean - np.float32(2) * mean_a * by_var - mean_b * by_cov
             slopes[y, 1, x], slopes[y, 2, x] = by_var, by_cov
         values[y] = _sum(terms)
-    return values, slopes
 
 
 @kernel
-def _blur_rows(slopes):
-    """Horizontal blur of [H, 3, L], in place of a copy."""
-    height, n, length = slopes.shape
-    out = np.zeros((height, n, length), np.float32)
-    for y in prange(height):
+def _blur_rows(first, last, slopes, out):
+    """Horizontal blur of [H, 3, L], zero beyond the border."""
+    _, n, length = slopes.shape
+    for y in range(first, last):
         row = np.zeros(length + 6 * HALF, np.float32)
         for k in range(n):
             for x in range(length):
@@ -98,16 +93,13 @@ def _blur_rows(slopes):
                 tap = TAPS[t]
                 for x in range(length):
                     out[y, k, x] += tap * row[x + 3 * t]
-    return out
 
 
 @kernel
-def _gather(slopes, a, b, weight, weight_ssim):
+def _gather(first, last, slopes, a, b, weight, weight_ssim, gradient, distance):
     """Gradient [H, L] of (1 − w) L1 + w (1 − SSIM) to a, and the weighted L1 by row."""
     height, _, length = slopes.shape
-    gradient = np.zeros((height, length), np.float32)
-    distance = np.zeros(height, np.float64)
-    for y in prange(height):
+    for y in range(first, last):
         m, terms = np.zeros((3, length), np.float32), np.empty(length, np.float32)
         for t in range(max(0, HALF - y), min(WINDOW, height + HALF - y)):
             tap = TAPS[t]
@@ -121,7 +113,6 @@ def _gather(slopes, a, b, weight, weight_ssim):
             by_ssim = m[0, x] + np.float32(2) * a[y, x] * m[1, x] + b[y, x] * m[2, x]
             gradient[y, x] = (np.float32(1) - weight_ssim) * sign * w - weight_ssim * by_ssim
         distance[y] = _sum(terms)
-    return gradient, distance
 
 
 def photometric(
@@ -134,34 +125,34 @@ def photometric(
     """
     shape = a.shape
     a, b, weight = (np.ascontiguousarray(v.reshape(shape[0], -1)) for v in (a, b, weight))
-    values, slopes = _compare(_blur_products(a, b), weight)
-    gradient, distance = _gather(_blur_rows(slopes), a, b, weight, np.float32(weight_ssim))
+    height, length = a.shape
+    values, distance = np.empty((2, height))
+    blurred, gradient = np.zeros((height, 5, length), np.float32), np.empty_like(a)
+    slopes, blurred_slopes = np.empty((2, height, 3, length), np.float32)
+    blurred_slopes[:] = 0
+    in_parts(_blur_products, height, a, b, blurred)
+    in_parts(_compare, height, blurred, weight, values, slopes)
+    in_parts(_blur_rows, height, slopes, blurred_slopes)
+    in_parts(_gather, height, blurred_slopes, a, b, weight, np.float32(weight_ssim), gradient,
+             distance)  # fmt: skip
     loss = (1 - weight_ssim) * distance.sum() + weight_ssim * (
         weight.sum(dtype=np.float64) - values.sum()
     )
     return float(loss), gradient.reshape(shape)
 
 
-@inline
+@body
 def _span(i, n, size):
     """Pixels [start, stop) of cell i of n by adaptive pooling: neighbours may share one."""
     return i * size // n, ((i + 1) * size + n - 1) // n
 
 
 @kernel
-def feature_distance(render, target, share, by_channel):
-    """Σ share · distance of pooled to target, by row of cells, and its gradient to `render`.
-
-    The distance is mean_c |pooled − target| by channel, else √(mean_c (pooled − target)²).
-
-    Args: render [H, W, C], target [h, w, C], share [h, w] what each cell counts, float32;
-      by_channel bool.
-    Returns: values [h] float64; gradient [H, W, C].
-    """
+def _compare_cells(first, last, render, target, share, by_channel, slopes, values):
+    """Slopes and values of rows of cells; see `feature_distance`."""
     height, width, channels = render.shape
     rows, columns = share.shape
-    slopes, values = np.empty((rows, columns, channels), np.float32), np.zeros(rows)
-    for i in prange(rows):
+    for i in range(first, last):
         top, bottom = _span(i, rows, height)
         mean = np.empty(channels, np.float32)
         for j in range(columns):
@@ -190,8 +181,14 @@ def feature_distance(render, target, share, by_channel):
                 slopes[i, j, c] = scale * slope if share[i, j] != 0 else np.float32(0)
             if share[i, j] != 0:  # what does not count may be anything
                 values[i] += share[i, j] * distance
-    gradient = np.empty((height, width, channels), np.float32)
-    for y in prange(height):
+
+
+@kernel
+def _spread(first, last, slopes, gradient):
+    """A cell's slopes, in rows of pixels, over those that it pools."""
+    height, width, channels = gradient.shape
+    rows, columns, _ = slopes.shape
+    for y in range(first, last):
         for x in range(width):
             for c in range(channels):
                 gradient[y, x, c] = np.float32(0)
@@ -203,4 +200,19 @@ def feature_distance(render, target, share, by_channel):
                     for x in range(left, right):
                         for c in range(channels):
                             gradient[y, x, c] += slopes[i, j, c]
+
+
+def feature_distance(render, target, share, by_channel) -> tuple[np.ndarray, np.ndarray]:
+    """Σ share · distance of pooled to target, by row of cells, and its gradient to `render`.
+
+    The distance is mean_c |pooled − target| by channel, else √(mean_c (pooled − target)²).
+
+    Args: render [H, W, C], target [h, w, C], share [h, w] what each cell counts, float32;
+      by_channel bool.
+    Returns: values [h] float64; gradient [H, W, C].
+    """
+    slopes, values = np.empty((*share.shape, render.shape[2]), np.float32), np.zeros(len(share))
+    gradient = np.empty(render.shape, np.float32)
+    in_parts(_compare_cells, len(share), render, target, share, by_channel, slopes, values)
+    in_parts(_spread, len(render), slopes, gradient)
     return values, gradient

@@ -151,8 +151,8 @@ class _FeatureDistance(torch.autograd.Function):
     ) -> Tensor:
         from chebsplat.training.loss_kernels import feature_distance
 
-        arrays = (t.detach().contiguous().numpy() for t in (render, target, share))
-        values, gradient = feature_distance(*arrays, by_channel)
+        a, b, counts = (t.detach().contiguous().numpy() for t in (render, target, share))
+        values, gradient = feature_distance(a, b, counts, by_channel)
         ctx.save_for_backward(torch.from_numpy(gradient))
         return render.new_tensor(values.sum())
 

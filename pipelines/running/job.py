@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
+from chebsplat.kernels.threads import n_threads
 from chebsplat.pipelines.planning.raw import unchanged
 from chebsplat.pipelines.running.precompile import precompile
 from chebsplat.pipelines.work import leases, store
 from chebsplat.pipelines.work.store import say
-from chebsplat.stages.runtime.command import Planned, n_threads, publish
+from chebsplat.stages.runtime.command import Planned, publish
 from chebsplat.stages.runtime.stopping import exit_code
 
 FINAL = {error.exit_code for error in (ConfigError, InputError, DataFailure)}
@@ -42,11 +43,11 @@ def run(plan: Path, key: str, again: bool = False) -> int:
 
 
 def use_threads() -> None:
-    """Set thread counts; to be called before torch and Numba are imported. Snakemake sets
+    """Set thread counts; to be called before torch is imported. Snakemake sets
     OMP_NUM_THREADS to the one thread that a rule declares; a stage may use all cores of the run.
     """
     if threads := os.environ.get("CHEBSPLAT_THREADS"):
-        os.environ |= {"OMP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": threads}
+        os.environ["OMP_NUM_THREADS"] = threads
 
 
 def read_step(plan: Path, key: str) -> tuple[dict[str, Any], Path]:

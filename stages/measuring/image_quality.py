@@ -9,7 +9,6 @@ from pathlib import Path
 from statistics import mode
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from safetensors import SafetensorError
@@ -20,6 +19,7 @@ from chebsplat.errors import InputError
 from chebsplat.evaluation.lpips import Lpips
 from chebsplat.evaluation.metrics import color_fitted, psnr
 from chebsplat.formats.capture import Capture
+from chebsplat.kernels.threads import n_threads
 from chebsplat.render import PARTS, SceneRenderer, focals, frame_parts
 from chebsplat.training.losses import ssim
 from chebsplat.views import View
@@ -163,4 +163,4 @@ def frame_split(renderer: SceneRenderer, cameras: list[View], repeats: int) -> d
         )
     size = {"width": cameras[0].width, "height": cameras[0].height}
     best = min(sweeps, key=lambda sweep: sum(sweep.values()))
-    return best | size | {"threads": numba.get_num_threads(), "device": "cpu"}
+    return best | size | {"threads": n_threads(), "device": "cpu"}

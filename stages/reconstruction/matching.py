@@ -18,8 +18,9 @@ from PIL import Image
 
 from chebsplat.cameras import centers
 from chebsplat.formats.capture import Capture
+from chebsplat.kernels.threads import n_threads
 from chebsplat.photos.guided import along_lines, fundamental
-from chebsplat.stages.runtime.command import Job, n_threads
+from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.settings import PoseSection, SfmSection
 from chebsplat.stages.sources.common import file_of
 

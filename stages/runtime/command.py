@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -16,6 +15,7 @@ import click
 
 from chebsplat.formats import artifact
 from chebsplat.formats.manifest import Manifest
+from chebsplat.kernels.threads import n_threads
 from chebsplat.stages.registry import MANY, STAGES, lesson_paths
 from chebsplat.stages.runtime import config as configs
 from chebsplat.stages.runtime.device import DEVICES, name_of, resolve
@@ -180,12 +180,6 @@ def publish(
             "compiled %d kernels in %.0f s, once", jit.compilation.kernels, jit.compilation.seconds
         )
     log.info("done in %.1f s", manifest.seconds)
-
-
-def n_threads() -> int:
-    """Threads that the kernels may use: OMP_NUM_THREADS where it is set, all cores otherwise."""
-    count = os.environ.get("OMP_NUM_THREADS", "")
-    return int(count) if count.isdigit() else os.cpu_count() or 1
 
 
 def _versions() -> dict[str, str]:

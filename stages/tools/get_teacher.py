@@ -25,9 +25,9 @@ from chebsplat.formats.files import parse_json
 from chebsplat.formats.images import images_below, read_rgb
 from chebsplat.formats.onnx_files import model_sha256, weight_files
 from chebsplat.formats.teacher_model import RESAMPLING, read_label_table, read_teacher
+from chebsplat.kernels.threads import n_threads
 from chebsplat.labels.scores import LOGITS, UNSURE, sureness
 from chebsplat.labels.tiling import window_starts
-from chebsplat.stages.runtime.command import n_threads
 from chebsplat.stages.settings import MAX_CHANNELS, TeacherSection
 from chebsplat.stages.teacher_models.label_space import closed_set, label_set, open_vocabulary
 from chebsplat.stages.tools.teacher_files import (

@@ -20,9 +20,10 @@ from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.points import Points, thinned
 from chebsplat.formats.splats import read_splats
 from chebsplat.formats.world import HERE, World
+from chebsplat.kernels.threads import n_threads
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.splats.gaussians import initial_gaussians, sh0_of, surface_of
-from chebsplat.stages.runtime.command import Job, n_threads
+from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import LiftSection
 from chebsplat.stages.training.defaults import LIFTED_FROM, OPEN, decided, evidence_of, resolved

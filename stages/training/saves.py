@@ -11,7 +11,8 @@ import torch
 
 from chebsplat.formats.artifact import digest, read_manifest
 from chebsplat.formats.files import atomic_path
-from chebsplat.stages.runtime.command import Job, n_threads
+from chebsplat.kernels.threads import n_threads
+from chebsplat.stages.runtime.command import Job
 
 log = logging.getLogger("chebsplat")
 SECONDS = 30.0  # between two saves

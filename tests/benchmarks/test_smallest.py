@@ -69,14 +69,15 @@ def work(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def as_many_threads(monkeypatch):
     """Benchmarks set how many threads compute; the tests after them have theirs again."""
-    import numba
     import torch
 
+    from chebsplat.kernels.threads import set_n_threads
+
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    before = torch.get_num_threads(), numba.get_num_threads()
+    before = torch.get_num_threads()
     yield
-    torch.set_num_threads(before[0])
-    numba.set_num_threads(before[1])
+    torch.set_num_threads(before)
+    set_n_threads(0)
 
 
 def capture_of_photos(folder):

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from shared import ROOT, gaussian_parameters
 
-import chebsplat.kernels.jit  # noqa: F401  # chooses the threading layer before gsply's numba
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.scene import Scene
 from chebsplat.formats.splats import read_splats, write_splats

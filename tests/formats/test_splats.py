@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit, logit
 from shared import gaussian_parameters
 
-import chebsplat.kernels.jit  # noqa: F401  # chooses the threading layer before gsply's numba
 from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats import ply
 from chebsplat.formats.semantics import Semantics

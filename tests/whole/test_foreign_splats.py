@@ -2,9 +2,6 @@
 theirs.
 """
 
-# gsply runs on numba too: the threading layer is chosen first
-import chebsplat.kernels.jit  # noqa: F401  # isort: skip
-
 import numpy as np
 import pytest
 from box_room import room
