@@ -87,8 +87,10 @@ STAGES: dict[str, Stage] = {
                    "labels."),
         Stage("sfm", "chebsplat.points/2", ("sfm",), (("capture", "ingest"),),
               # transforms bring no points, and poses that a depth camera tracks are adjusted
-              seconds=lambda k: 0.5
-              + {"transforms": 1.0, "seven_scenes": 2.6}.get(k.kind, 0.3) * k.trained,
+              # most photos that come alone are swept, each reduced to the same few pixels
+              seconds=lambda k: 0.5 + 0.1 * k.trained + 0.25 * k.photos
+              if k.kind in ("photos", "video")
+              else 0.5 + {"transforms": 1.0, "seven_scenes": 2.6}.get(k.kind, 0.3) * k.trained,
               megabytes=lambda k: 2.3, minutes=100,  # 5 with depth; 295 MB
               help="Cameras and points with normals and local anisotropic covariances."),
         Stage("channels", "chebsplat.channels/2", ("channels",),

@@ -80,7 +80,7 @@ def adjust(
         bundle.print_summary = False
         bundle.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
         if framed is None or len(errors) <= FREE:
-            pycolmap.bundle_adjustment(model, bundle)
+            bundle_all(model, bundle)
         else:
             _bundle_near(model, _images(model, names), sensor_poses, bundle, framed.spread[1])
         images = _images(model, names)
@@ -273,6 +273,20 @@ def _put(image: pycolmap.Image, pose: np.ndarray) -> None:
     """Set the pose [3, 4] of an image."""
     assert image.frame is not None  # every image of a reconstruction has one
     image.frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pose))
+
+
+def bundle_all(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
+    """Bundle adjustment of a whole model, in place.
+
+    Choices: as `pycolmap.bundle_adjustment`, which would write COLMAP's own lines to stderr, from
+      then on all of them, whatever the level of its log is.
+    """
+    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
+    config = pycolmap.BundleAdjustmentConfig()
+    for identity in model.reg_image_ids():
+        config.add_image(identity)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
 
 
 def _bundle_near(

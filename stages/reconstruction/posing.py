@@ -15,6 +15,7 @@ import pycolmap
 
 from chebsplat.formats.photo_model import PhotoModel
 from chebsplat.stages.reconstruction import judge
+from chebsplat.stages.reconstruction.adjustment import bundle_all
 from chebsplat.stages.reconstruction.matching import (
     chosen_pairs,
     empty_database,
@@ -184,7 +185,7 @@ def _refine(model: pycolmap.Reconstruction) -> None:
     # of 0 it takes five times as long for the same cameras
     options.ceres.solver_options.function_tolerance = 1e-5
     for _ in range(2):
-        pycolmap.bundle_adjustment(model, options)
+        bundle_all(model, options)
         pycolmap.ObservationManager(model).filter_all_points3D(STRAY, FLATTEST)
     model.update_point_3d_errors()
 

@@ -61,9 +61,11 @@ class Progress:
 
     @contextmanager
     def alive(self) -> Iterator[None]:
-        """Say within how long the work has taken, wherever it says nothing for a fifth more than
-        `every` seconds.
+        """Say how long the work should take, if longer than `every` seconds, and how long it has
+        taken wherever a fifth more than these pass in silence.
         """
+        if self.expected is not None and self.expected > self.every:
+            self._say(self._left().strip())  # its process took seconds to begin
         over = threading.Event()
 
         def watch() -> None:

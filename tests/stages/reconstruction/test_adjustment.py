@@ -11,6 +11,7 @@ from chebsplat.cameras import centers
 from chebsplat.stages.reconstruction.adjustment import (
     adjust,
     alignment,
+    bundle_all,
     differences,
     frame,
     localized,
@@ -48,6 +49,25 @@ def test_alignment_of_views_from_one_place_keeps_units():
     assert scale == 1
     np.testing.assert_allclose(rotation, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(shift, 0, atol=1e-9)
+
+
+def test_a_bundle_adjustment_of_all_is_colmaps_own_but_for_its_words(capfd):
+    noise, options = pycolmap.SyntheticNoiseOptions(), pycolmap.BundleAdjustmentOptions()
+    noise.point2D_stddev, noise.point3D_stddev = 1.0, 0.05
+    options.print_summary = False
+    ours = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions())
+    pycolmap.synthesize_noise(noise, ours)
+    before = [image.cam_from_world().matrix() for image in ours.images.values()]
+    theirs = pycolmap.Reconstruction(ours)
+    bundle_all(ours, options)
+    assert capfd.readouterr() == ("", "")
+    pycolmap.bundle_adjustment(theirs, options)
+    found, wanted = (
+        [image.cam_from_world().matrix() for image in model.images.values()]
+        for model in (ours, theirs)
+    )
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+    assert not np.allclose(found, before, atol=1e-4)
 
 
 def test_points_of_depth_fill_what_triangulation_leaves():
