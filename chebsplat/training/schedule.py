@@ -8,6 +8,7 @@ import torch
 
 from chebsplat.settings import MOST_STEPS, TrainSection
 from chebsplat.splats.sh import MAX_DEGREE
+from chebsplat.training.adam import adam
 from chebsplat.training.model import SceneModel
 
 STEP_SIDE = 640  # pixels of the longer side of what a step looks at, at least
@@ -42,7 +43,7 @@ def rates(settings: TrainSection) -> dict[str, float]:
     return {name: rate for name, rate in by_name.items() if rate is not None}
 
 
-def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.optim.Adam:
+def optimizer_of(model: SceneModel, settings: TrainSection, extent: float) -> torch.optim.Adam:
     """A group for each raw parameter of the model, one for SH bands 1 to 3 together, which have one
     rate (each group is two launches on a GPU), and one for its modules, with their `rate` before
     any schedule.
@@ -59,7 +60,7 @@ def adam(model: SceneModel, settings: TrainSection, extent: float) -> torch.opti
         )
     if weights := [p for module in model.modules.values() for p in module.parameters()]:
         groups["modules"] = {"params": weights, "rate": LR_MODULES, "name": "modules"}
-    return torch.optim.Adam(list(groups.values()), eps=1e-15, fused=True)
+    return adam(list(groups.values()))
 
 
 class Schedule:

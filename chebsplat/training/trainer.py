@@ -27,7 +27,7 @@ from chebsplat.training.model import Rendered, SceneModel
 from chebsplat.training.population import Population, broken
 from chebsplat.training.printed import PrintedScene
 from chebsplat.training.replay import Replay
-from chebsplat.training.schedule import Schedule, adam
+from chebsplat.training.schedule import Schedule, optimizer_of
 from chebsplat.views import TaughtLabels, Views, Window, reduced
 
 WEIGHT_SSIM = 0.2  # share of SSIM in the colour loss, 3DGS's λ
@@ -56,7 +56,7 @@ class Trainer:
         self.feature_every, self.weight_depth = settings.feature_every, settings.weight_depth
         self.members = torch.zeros(0, 0, dtype=torch.int64)
         self.guidance: Tensor | None = None
-        self.optimizer = adam(self.model, self.settings, self.extent)
+        self.optimizer = optimizer_of(self.model, self.settings, self.extent)
         self.order_generator = np.random.default_rng(settings.seed)
         self.generator = torch.Generator().manual_seed(settings.seed)
         # a recording has one pass backward
@@ -167,7 +167,7 @@ class Trainer:
         model.raw = {name: value.requires_grad_(True) for name, value in state["raw"].items()}
         for name, module in model.modules.items():
             module.load_state_dict(state["modules"][name])
-        self.optimizer = adam(self.model, self.settings, self.extent)
+        self.optimizer = optimizer_of(self.model, self.settings, self.extent)
         self.optimizer.load_state_dict(state["optimizer"])
         self.order_generator.bit_generator.state = state["order_generator"]
         self.generator.set_state(state["generator"])

@@ -11,7 +11,6 @@ import torch
 
 from chebsplat.formats.artifact import digest, read_manifest
 from chebsplat.formats.files import atomic_path
-from chebsplat.kernels.threads import n_threads
 from chebsplat.stages.runtime.command import Job
 
 log = logging.getLogger("chebsplat")
@@ -22,8 +21,8 @@ LAYOUT = 3  # of a state: one of another layout is not resumed
 class Saves:
     """Saves of the state of one training in the job's scratch folder; the last one stays.
 
-    A state fits only the same settings, inputs, package versions, device and number of threads:
-    otherwise the training starts anew, with a warning.
+    A state fits only the same settings, inputs, package versions and device: otherwise the training
+    starts anew, with a warning.
     """
 
     def __init__(self, job: Job):
@@ -36,7 +35,6 @@ class Saves:
                 "config": settings,
                 "device": job.device,
                 "versions": versions,
-                "threads": n_threads(),
                 "layout": LAYOUT,
             }
         )

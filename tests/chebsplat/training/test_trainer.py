@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from shared import ROOT
+from thread_counts import assert_same_bits
 
 from benchmarks.stability.training import four_views, tiny_trainer
 from chebsplat.errors import DataFailure
@@ -404,3 +405,18 @@ def test_a_window_shows_its_part_of_the_picture():
     )  # large Gaussians beyond the border
     photo, _ = made.views.photo(1, window)
     assert torch.equal(photo, made.views.images[1][3:14, 5:22])
+
+
+def test_a_training_ends_in_the_same_bits_on_any_number_of_threads():
+    def compute():
+        made = tiny_trainer(steps=30, weight_depth=1.0, depth_every=2)
+        for _ in made.steps():
+            pass
+        return list(made.finish().values())
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)  # as the stage does
+    try:
+        assert_same_bits(compute)
+    finally:
+        torch.set_num_threads(before)
