@@ -7,18 +7,18 @@ long to compile.
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from queue import SimpleQueue
 from typing import Any
 
-Kernel = Callable[..., None]
-Job = tuple[Kernel, Sequence[Any], "SimpleQueue[BaseException | None]"]
+import numpy as np
 
-_jobs: SimpleQueue[Job] = SimpleQueue()
-_workers: list[threading.Thread] = []
+Kernel = Callable[..., None]
+
+_workers: list[Worker] = []
 _count = 0
 
 
@@ -40,7 +40,7 @@ def in_parts(kernel: Kernel, n: int, *arguments: Any) -> None:
     """Call kernel(first, last, *arguments) for parts of 0...n − 1, one a thread, and wait."""
     parts = max(min(n_threads(), n), 1)
     bounds = [part * n // parts for part in range(parts + 1)]
-    _run(kernel, [(*pair, *arguments) for pair in pairwise(bounds)])
+    _run(kernel, [(*pair, *arguments) for pair in itertools.pairwise(bounds)])
 
 
 def in_every_thread(kernel: Kernel, *arguments: Any) -> None:
@@ -52,22 +52,43 @@ def in_every_thread(kernel: Kernel, *arguments: Any) -> None:
 
 def _run(kernel: Kernel, calls: Sequence[Sequence[Any]]) -> None:
     """The first call in this thread, the others in workers. Raises the first failure."""
-    done: SimpleQueue[BaseException | None] = SimpleQueue()
-    while len(_workers) < len(calls) - 1:
-        _workers.append(threading.Thread(target=_work, daemon=True, name="kernels"))
-        _workers[-1].start()
-    for arguments in calls[1:]:
-        _jobs.put((kernel, arguments, done))
+    from chebsplat.kernels.waiting import wait_a_moment
+
+    others = calls[1:]
+    while len(_workers) < len(others):
+        _workers.append(Worker())
+    finished = np.zeros(len(others), np.int64)
+    failures: SimpleQueue[BaseException | None] = SimpleQueue()
+    for k, arguments in enumerate(others):
+        _workers[k].take(kernel, arguments, failures, finished[k : k + 1])
     first = _attempt(kernel, calls[0])
-    for failure in [first, *[done.get() for _ in calls[1:]]]:
+    wait_a_moment(finished, 1)
+    for failure in [first, *[failures.get() for _ in others]]:
         if failure is not None:
             raise failure
 
 
-def _work() -> None:
-    while True:
-        kernel, arguments, done = _jobs.get()
-        done.put(_attempt(kernel, arguments))
+class Worker:
+    """A thread that makes calls one after another, and waits a moment before it sleeps."""
+
+    def __init__(self) -> None:
+        self.jobs: SimpleQueue[tuple[Any, ...]] = SimpleQueue()
+        self.taken = np.zeros(1, np.int64)  # jobs so far
+        threading.Thread(target=self._work, daemon=True, name="kernels").start()
+
+    def take(self, *job: Any) -> None:
+        """Add a job: kernel, its arguments, a queue for its failure, a mark to set when done."""
+        self.jobs.put(job)
+        self.taken += 1
+
+    def _work(self) -> None:
+        from chebsplat.kernels.waiting import wait_a_moment
+
+        for number in itertools.count(1):
+            wait_a_moment(self.taken, number)
+            kernel, arguments, failures, finished = self.jobs.get()
+            failures.put(_attempt(kernel, arguments))
+            finished[0] = 1
 
 
 def _attempt(kernel: Kernel, arguments: Sequence[Any]) -> BaseException | None:
@@ -78,10 +99,5 @@ def _attempt(kernel: Kernel, arguments: Sequence[Any]) -> BaseException | None:
     return None
 
 
-def _forget_workers() -> None:
-    """A forked process has none of its parent's threads, and may hold a copy of a taken lock."""
-    global _jobs
-    _jobs, _workers[:] = SimpleQueue(), []
-
-
-os.register_at_fork(after_in_child=_forget_workers)
+# a forked process has none of its parent's threads
+os.register_at_fork(after_in_child=_workers.clear)

@@ -1,8 +1,8 @@
 """Losses with their gradients in one sweep over an image, in numba: L1 and SSIM; feature distance.
 
 Images are [H, W, 3] seen as rows of W · 3 values, so a tap of the horizontal window is a shift by
-3. Rows are independent in each of four passes; no pass writes what another thread writes, so the
-thread count changes no bit.
+3. A part of the rows computes its neighbours' ends once more instead of waiting for them: no thread
+writes what another writes, and their number changes no bit.
 """
 
 from __future__ import annotations
@@ -24,21 +24,37 @@ TAPS = (np.exp(-0.5 * (_x / SIGMA) ** 2) / np.exp(-0.5 * (_x / SIGMA) ** 2).sum(
 TINY = np.float32(1e-12)
 
 
-@kernel
-def _blur_products(first, last, a, b, out):
-    """Horizontal blur of a, b, a², b², ab: [H, L] twice -> [H, 5, L], zero beyond the border."""
+@body
+def _blur_products(a, b, y, row, out):
+    """Horizontal blur of row y of a, b, a², b², ab into out [5, L], zero beyond the border."""
     length = a.shape[1]
-    for y in range(first, last):
-        row = np.zeros((5, length + 6 * HALF), np.float32)
-        for x in range(length):
-            u, v = a[y, x], b[y, x]
-            row[0, x + 3 * HALF], row[1, x + 3 * HALF] = u, v
-            row[2, x + 3 * HALF], row[3, x + 3 * HALF], row[4, x + 3 * HALF] = u * u, v * v, u * v
-        for k in range(5):
-            for t in range(WINDOW):
-                tap = TAPS[t]
-                for x in range(length):
-                    out[y, k, x] += tap * row[k, x + 3 * t]
+    for x in range(length):
+        u, v = a[y, x], b[y, x]
+        row[0, x + 3 * HALF], row[1, x + 3 * HALF] = u, v
+        row[2, x + 3 * HALF], row[3, x + 3 * HALF], row[4, x + 3 * HALF] = u * u, v * v, u * v
+    _blur(row, out)
+
+
+@body
+def _blur(row, out):
+    """Horizontal blur of rows [K, L + 6 HALF] into out [K, L]."""
+    out[:] = np.float32(0)
+    for k in range(len(out)):
+        for t in range(WINDOW):
+            tap = TAPS[t]
+            for x in range(out.shape[1]):
+                out[k, x] += tap * row[k, x + 3 * t]
+
+
+@body
+def _gather(ring, y, height, out):
+    """Vertical blur at row y of the rows about it, which `ring` [WINDOW, K, L] holds."""
+    out[:] = np.float32(0)
+    for t in range(max(0, HALF - y), min(WINDOW, height + HALF - y)):
+        tap, near = TAPS[t], ring[(y + t - HALF) % WINDOW]
+        for k in range(len(out)):
+            for x in range(out.shape[1]):
+                out[k, x] += tap * near[k, x]
 
 
 @body
@@ -50,69 +66,68 @@ def _sum(terms):
     return total
 
 
-@kernel
-def _compare(first, last, blurred, weight, values, slopes):
-    """SSIM by row, under a weight [H, L]; derivatives [H, 3, L] to mean, variance, covariance."""
-    height, _, length = blurred.shape
-    for y in range(first, last):
-        m, terms = np.zeros((5, length), np.float32), np.empty(length, np.float32)
-        for t in range(max(0, HALF - y), min(WINDOW, height + HALF - y)):
-            tap = TAPS[t]
-            for k in range(5):
-                for x in range(length):
-                    m[k, x] += tap * blurred[y + t - HALF, k, x]
-        for x in range(length):
-            mean_a, mean_b = m[0, x], m[1, x]
-            squares = mean_a * mean_a + mean_b * mean_b
-            top_1 = np.float32(2) * mean_a * mean_b + C1
-            top_2 = np.float32(2) * (m[4, x] - mean_a * mean_b) + C2
-            low_1, low_2 = squares + C1, m[2, x] + m[3, x] - squares + C2
-            over = np.float32(1) / (low_1 * low_2)
-            value, w = top_1 * top_2 * over, weight[y, x]
-            terms[x] = w * value
-            by_cov = np.float32(2) * top_1 * over * w
-            by_var = -value / low_2 * w
-            by_mean = (
-                np.float32(2) * mean_b * top_2 * over - np.float32(2) * mean_a * value / low_1
-            ) * w
-            slopes[y, 0, x] = by_mean - np.float32(2) * mean_a * by_var - mean_b * by_cov
-            slopes[y, 1, x], slopes[y, 2, x] = by_var, by_cov
-        values[y] = _sum(terms)
+@body
+def _compare(m, weight, terms, row):
+    """SSIM by value under a weight [L], and its slopes to mean, variance and covariance into row,
+    from blurred a, b, a², b², ab [5, L].
+    """
+    for x in range(len(weight)):
+        mean_a, mean_b = m[0, x], m[1, x]
+        squares = mean_a * mean_a + mean_b * mean_b
+        top_1 = np.float32(2) * mean_a * mean_b + C1
+        top_2 = np.float32(2) * (m[4, x] - mean_a * mean_b) + C2
+        low_1, low_2 = squares + C1, m[2, x] + m[3, x] - squares + C2
+        over = np.float32(1) / (low_1 * low_2)
+        value, w = top_1 * top_2 * over, weight[x]
+        terms[x] = w * value
+        by_cov = np.float32(2) * top_1 * over * w
+        by_var = -value / low_2 * w
+        by_mean = (
+            np.float32(2) * mean_b * top_2 * over - np.float32(2) * mean_a * value / low_1
+        ) * w
+        row[0, x + 3 * HALF] = by_mean - np.float32(2) * mean_a * by_var - mean_b * by_cov
+        row[1, x + 3 * HALF], row[2, x + 3 * HALF] = by_var, by_cov
+
+
+@body
+def _to_gradient(m, a, b, weight, weight_ssim, terms, gradient):
+    """Gradient [L] of (1 − w) L1 + w (1 − SSIM) to a, from blurred slopes [3, L]; weighted L1."""
+    for x in range(len(a)):
+        difference, w = a[x] - b[x], weight[x]
+        terms[x] = w * abs(difference)
+        sign = np.float32(difference > 0) - np.float32(difference < 0)
+        by_ssim = m[0, x] + np.float32(2) * a[x] * m[1, x] + b[x] * m[2, x]
+        gradient[x] = (np.float32(1) - weight_ssim) * sign * w - weight_ssim * by_ssim
 
 
 @kernel
-def _blur_rows(first, last, slopes, out):
-    """Horizontal blur of [H, 3, L], zero beyond the border."""
-    _, n, length = slopes.shape
-    for y in range(first, last):
-        row = np.zeros(length + 6 * HALF, np.float32)
-        for k in range(n):
-            for x in range(length):
-                row[x + 3 * HALF] = slopes[y, k, x]
-            for t in range(WINDOW):
-                tap = TAPS[t]
-                for x in range(length):
-                    out[y, k, x] += tap * row[x + 3 * t]
+def _photometric(first, last, a, b, weight, weight_ssim, gradient, values, distance):
+    """Gradient, SSIM and L1 of rows first...last − 1.
 
-
-@kernel
-def _gather(first, last, slopes, a, b, weight, weight_ssim, gradient, distance):
-    """Gradient [H, L] of (1 − w) L1 + w (1 − SSIM) to a, and the weighted L1 by row."""
-    height, _, length = slopes.shape
-    for y in range(first, last):
-        m, terms = np.zeros((3, length), np.float32), np.empty(length, np.float32)
-        for t in range(max(0, HALF - y), min(WINDOW, height + HALF - y)):
-            tap = TAPS[t]
-            for k in range(3):
-                for x in range(length):
-                    m[k, x] += tap * slopes[y + t - HALF, k, x]
-        for x in range(length):
-            difference, w = a[y, x] - b[y, x], weight[y, x]
-            terms[x] = w * abs(difference)
-            sign = np.float32(difference > 0) - np.float32(difference < 0)
-            by_ssim = m[0, x] + np.float32(2) * a[y, x] * m[1, x] + b[y, x] * m[2, x]
-            gradient[y, x] = (np.float32(1) - weight_ssim) * sign * w - weight_ssim * by_ssim
-        distance[y] = _sum(terms)
+    A row waits for the rows about it, twice: it is blurred, compared HALF rows later, and its
+    gradient follows after as many again. Rings hold the rows that are still to be asked for, and
+    those beyond the part's ends are computed by its neighbour, too.
+    """
+    height, length = a.shape
+    blurred = np.empty((WINDOW, 5, length), np.float32)
+    slopes = np.empty((WINDOW, 3, length), np.float32)
+    row, m = np.zeros((5, length + 6 * HALF), np.float32), np.empty((5, length), np.float32)
+    terms = np.empty(length, np.float32)
+    for ahead in range(max(first - 2 * HALF, 0), last + 2 * HALF):
+        if ahead < height:
+            _blur_products(a, b, ahead, row, blurred[ahead % WINDOW])
+        y = ahead - HALF
+        if max(first - HALF, 0) <= y < min(last + HALF, height):
+            _gather(blurred, y, height, m)
+            _compare(m, weight[y], terms, row)
+            _blur(row[:3], slopes[y % WINDOW])
+            if first <= y < last:
+                values[y] = _sum(terms)
+        y = ahead - 2 * HALF
+        if first <= y < last:
+            _gather(slopes, y, height, m[:3])
+            _to_gradient(m, a[y], b[y], weight[y], weight_ssim, terms, gradient[y])
+            distance[y] = _sum(terms)
 
 
 def photometric(
@@ -125,15 +140,8 @@ def photometric(
     """
     shape = a.shape
     a, b, weight = (np.ascontiguousarray(v.reshape(shape[0], -1)) for v in (a, b, weight))
-    height, length = a.shape
-    values, distance = np.empty((2, height))
-    blurred, gradient = np.zeros((height, 5, length), np.float32), np.empty_like(a)
-    slopes, blurred_slopes = np.empty((2, height, 3, length), np.float32)
-    blurred_slopes[:] = 0
-    in_parts(_blur_products, height, a, b, blurred)
-    in_parts(_compare, height, blurred, weight, values, slopes)
-    in_parts(_blur_rows, height, slopes, blurred_slopes)
-    in_parts(_gather, height, blurred_slopes, a, b, weight, np.float32(weight_ssim), gradient,
+    gradient, (values, distance) = np.empty_like(a), np.empty((2, len(a)))
+    in_parts(_photometric, len(a), a, b, weight, np.float32(weight_ssim), gradient, values,
              distance)  # fmt: skip
     loss = (1 - weight_ssim) * distance.sum() + weight_ssim * (
         weight.sum(dtype=np.float64) - values.sum()

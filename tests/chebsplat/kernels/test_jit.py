@@ -78,8 +78,8 @@ def test_a_home_folder_that_takes_nothing_costs_no_run(tmp_path, how):
 CLONE = """
 import numpy as np
 from chebsplat.kernels import jit
-from chebsplat.training.loss_kernels import _blur_rows
-_blur_rows(0, 16, np.ones((16, 3, 48), np.float32), np.ones((16, 3, 48), np.float32))
+from chebsplat.training.loss_kernels import _spread
+_spread(0, 16, np.ones((4, 4, 8), np.float32), np.ones((16, 16, 8), np.float32))
 print(jit.__file__, jit.compilation.kernels)
 """
 
