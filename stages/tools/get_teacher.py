@@ -33,6 +33,7 @@ from chebsplat.stages.teacher_models.label_space import closed_set, label_set, o
 from chebsplat.stages.tools.teacher_files import (
     ADDRESS,
     AGAIN,
+    copy,
     full_address,
     gather,
     stem_of,
@@ -85,10 +86,10 @@ def get_teacher(
     folder = out or Path(short)
     model = folder / f"{short}.onnx"
     if folder.exists():
-        if not model.is_file() or read_teacher(model).origin != origin:
-            raise ConfigError(
-                f"{folder} exists and is not {origin}; remove it, or choose another --out"
-            )
+        other = not model.is_file() or read_teacher(model).origin != origin
+        if other or settings is not None:
+            why = f"is not {origin}" if other else f"keeps its TOML, whatever {settings} says"
+            raise ConfigError(f"{folder} exists and {why}; remove it, or choose another --out")
         compare(sha256, model, origin)
         return model, check(model)
     part = folder.with_name(f".part-{folder.name}")
@@ -137,12 +138,11 @@ def from_hub(repository: str, revision: str, graph: str, model: Path) -> dict[st
         for name in weight_files(files[graph])
     }
     shutil.copyfile(files[graph], model)
-    for name, file in weights.items():
-        (model.parent / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, model.parent / name)
     labels = model.with_suffix(".txt")
     classes = class_names(files[CLASSES], repository)
     labels.write_text("\n".join(classes) + "\n", encoding="utf-8")
+    for name, file in weights.items():
+        copy(str(file), model.parent / name, AGAIN)
     return {"output": "logits", "labels": labels.name} | preparation(files[PREPARATION], repository)
 
 
