@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -175,7 +176,7 @@ def _is_text(value: Any, longest: int = 1000) -> bool:
     return isinstance(value, str) and 0 < len(value) <= longest and not unprintable(value)
 
 
-RULES = {
+RULES: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "name": ("a word", _is_text),
     "output": ('"features" or "logits"', lambda v: v in ("features", "logits")),
     "tensor": ("the name of an output", _is_text),
