@@ -2,8 +2,7 @@
 
 Every reader of such a file goes through here, so that a pipe, a device, a folder, a file of
 gigabytes, bytes that are no text and a document nested a thousand levels deep are refused at once,
-in the same words everywhere. A disk that is full, over quota or read-only, or takes no name so
-long, is reported in one line.
+in the same words everywhere. A disk that is full, over quota or read-only is reported in one line.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ RESTORE = "restore the file"
 ENDLESS_KEY = re.compile(r"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){64}""")
 SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 CLOSED = {errno.EROFS, errno.EACCES, errno.EPERM}
-REFUSALS = {errno.ENOSPC, errno.EDQUOT, errno.ENAMETOOLONG} | CLOSED
+REFUSALS = {errno.ENOSPC, errno.EDQUOT} | CLOSED
 # the name of the file in an error of writing it (`stages.runtime.stopping.streams`)
 OUTPUT = "standard output"
 
@@ -185,10 +184,6 @@ def _failure(fault: OSError, folder: Path, scratch: bool) -> ChebsplatError:
             "elsewhere"
         )
     file = Path(os.fsdecode(fault.filename)) if isinstance(fault.filename, str | bytes) else folder
-    if fault.errno == errno.ENAMETOOLONG:
-        return DiskFailure(
-            f"{file.name[:60]}... is too long a name for a file; choose a shorter one"
-        )
     if fault.errno in CLOSED:
         if file.exists() and not os.access(file, os.R_OK):
             return InputError(

@@ -4,13 +4,15 @@ an ONNX file; and a trial of a teacher on an image before a scene: its settings,
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
 import re
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -53,6 +55,21 @@ STEPS = (  # of an image processor: those that keys of a TOML replace, and those
 N_LABELS, N_PHOTOS = 8, 8  # of a trial
 
 
+@contextmanager
+def _short_names() -> Iterator[None]:
+    """Raises ConfigError where a file's name is longer than the disk takes."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        raise ConfigError(
+            f"{Path(error.filename).name[:60]}... cannot be written ({error.strerror}); give it a "
+            "shorter name, or choose another --out"
+        ) from None
+
+
+@_short_names()
 def get_teacher(
     name: str,
     out: Path | None = None,

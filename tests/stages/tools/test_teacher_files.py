@@ -11,7 +11,6 @@ from served import Quiet, served
 from tiny_teachers import COLORS, color_teacher, moved_out, write_model
 
 from chebsplat.errors import ChebsplatError, ConfigError, InputError
-from chebsplat.formats.files import explained
 from chebsplat.formats.onnx_files import model_sha256
 from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.stages.tools.get_teacher import get_teacher
@@ -199,13 +198,15 @@ def test_what_is_no_teacher_is_one_line_and_leaves_no_folder(place, tmp_path, ca
             (f"http://127.0.0.1:9/{end}", "names no file; give the address of the .onnx itself")
             for end in ("", "models/", "..", "%2e%2e", "?of=tiny.onnx", "a%00.onnx")
         ),
-        (f"http://127.0.0.1:9/{'x' * 300}.onnx", r"xxx\.\.\. is too long a name.*choose a shorter"),
-        (f"{'x' * 250}.onnx", r"\.part-x+\.\.\. is too long a name"),
+        (
+            f"http://127.0.0.1:9/{'x' * 300}.onnx",
+            r"^x+\.\.\. cannot be written .*give it a shorter name",
+        ),
+        (f"{'x' * 250}.onnx", r"^\.part-x+\.\.\. cannot be written"),
     ],
 )
 def test_what_is_not_reached_or_read_is_one_line(place, address, word):
-    """As a command has it, which explains what the disk refuses, too."""
-    with pytest.raises(ChebsplatError, match=word) as error, explained(place.parent):
+    with pytest.raises(ChebsplatError, match=word) as error:
         get_teacher(address)
     assert "\n" not in str(error.value) and not list(Path().iterdir())
 
