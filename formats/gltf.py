@@ -17,6 +17,7 @@ import numpy as np
 
 from chebsplat.errors import InputError
 from chebsplat.formats.files import LARGEST
+from chebsplat.formats.names import check_names
 from chebsplat.formats.packed import C0, raw_parameters
 from chebsplat.formats.ply import REST
 from chebsplat.formats.semantics import Semantics
@@ -40,6 +41,7 @@ COLORS = "srgb_rec709_display"
 IDS, TABLES = "EXT_mesh_features", "EXT_structural_metadata"
 SCHEMA = "chebsplat"  # id of the tables' schema
 NO_LABEL = "(none)"  # name of -1 in the enumeration of labels
+SINGLE = np.finfo(np.float32)
 # components of attributes, and the integers, normalised, that each may be stored as
 SIGNED, UNSIGNED = ("int8", "int16"), ("uint8", "uint16")
 PARTS: dict[str, tuple[int, tuple[str, ...]]] = {
@@ -140,7 +142,8 @@ def write_splat_glb(
 ) -> None:
     """Write raw parameters (`formats.gaussians.Gaussians.parameters`); args as of `ply.write_ply`.
 
-    Choices: viewers without the extension draw points in COLOR_0.
+    Choices: viewers without the extension draw points in COLOR_0. Sizes beyond float32 become its
+      least and largest, for of a size of 0 no reader can compute.
     """
     from scipy.special import expit  # a command that only asks for help needs none
 
@@ -149,12 +152,13 @@ def write_splat_glb(
     unit /= np.linalg.norm(unit, axis=1, keepdims=True).clip(1e-300)
     unit *= [1, 1, -1, -1]
     opacities = expit(parameters["logit_opacities"].astype(np.float64))
+    sizes = world.scale * np.exp(parameters["log_scales"].astype(np.float64))
     display = (parameters["sh0"][:, 0].astype(np.float64) * C0 + 0.5).clip(0, 1)
     attributes = {
         "POSITION": means,
         "COLOR_0": linear_light(display, opacities),
         f"{SPLAT}:ROTATION": unit[:, [1, 2, 3, 0]].astype(np.float32),
-        f"{SPLAT}:SCALE": (world.scale * np.exp(parameters["log_scales"])).astype(np.float32),
+        f"{SPLAT}:SCALE": sizes.clip(SINGLE.tiny, SINGLE.max).astype(np.float32),
         f"{SPLAT}:OPACITY": opacities.astype(np.float32),
     }
     light = np.concatenate([parameters["sh0"], parameters["shN"] * TURNED[:, None]], 1)
@@ -335,11 +339,13 @@ def read_meanings(path: Path) -> Semantics | None:
         values = metadata["schema"]["enums"]["label"]["values"]
         with np.errstate(invalid="ignore"):  # of what is no number, and no row
             meanings = glb.attribute("_FEATURE_ID_0", 1)[:, 0].astype(np.int64)
+        names = [value["name"] for value in values if value["value"] >= 0]
+        check_names(names, "names of classes", path, f"name another splat, or {REMEDY}")
         return Semantics(
             meanings,
             glb.column(0, "label", "<i4")[:, 0],
             glb.column(0, "feature", "<f4"),
-            [value["name"] for value in values if value["value"] >= 0],
+            names,
             glb.column(1, "feature", "<f4"),
         )
     except DAMAGED as error:

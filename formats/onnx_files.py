@@ -73,8 +73,10 @@ def _named(path: Path, stamp: tuple[int, ...]) -> tuple[str, ...] | None:
         if entry.key == "location"
     ]
     for name in names:
-        if os.path.isabs(name) or name.startswith("..") or "\0" in name:
-            raise InputError(f"{path} has weights outside its folder ({name[:100]!r}); {EXPORT}")
+        if os.path.isabs(name) or name.startswith("..") or name == "." or "\0" in name:
+            raise InputError(
+                f"{path} has weights outside its folder, or in no file ({name[:100]!r}); {EXPORT}"
+            )
     return tuple(dict.fromkeys(name for name in names if name != path.name))
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from chebsplat.errors import InputError
 from chebsplat.formats.artifact import sha256_file
 from chebsplat.formats.files import atomic_path
+from chebsplat.formats.names import check_names
 from chebsplat.formats.tensors import read_npz
 
 FIELDS = ("meanings", "labels", "features", "names", "embeddings", "splat")
@@ -98,7 +99,8 @@ def read_beside(splat: Path) -> Semantics | None:
         if str(stored["splat"]) != sha256_file(splat):
             raise ValueError(f"it is not of the {splat.name} beside it")
         features, embeddings = (stored[name].astype(np.float32) for name in FIELDS[2:5:2])
-        names = [str(name) for name in stored["names"]]
+        names = [name.item() for name in stored["names"]]
+        check_names(names, "names of classes", path, REMEDY)
         meanings, labels = (stored[name].astype(np.int64) for name in FIELDS[:2])
         return Semantics(meanings, labels, features, names, embeddings)
     except (ValueError, LookupError, TypeError) as error:

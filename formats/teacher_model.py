@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +27,7 @@ LARGEST = (
     4  # largest plausible mean or std of colours in 0 to 1, of models with rescaled inputs, too
 )
 RESAMPLING = ("nearest", "lanczos", "bilinear", "bicubic", "box", "hamming")  # by Pillow's numbers
+LONGEST_ORIGIN = 8192  # characters; servers take no longer addresses
 FILES = ("labels", "text", "tokenizer")
 TEXT_PACKAGE = "minilm"  # `text` may name the optional extra instead of a file
 
@@ -170,11 +172,11 @@ def _is_side(value: Any) -> bool:
     return type(value) is int and 0 < value <= MAX_SIDE
 
 
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and 0 < len(value) <= 1000 and not unprintable(value)
+def _is_text(value: Any, longest: int = 1000) -> bool:
+    return isinstance(value, str) and 0 < len(value) <= longest and not unprintable(value)
 
 
-RULES = {
+RULES: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "name": ("a word", _is_text),
     "output": ('"features" or "logits"', lambda v: v in ("features", "logits")),
     "tensor": ("the name of an output", _is_text),
@@ -188,7 +190,10 @@ RULES = {
     ),
     "multiple": (f"a whole number, 1 to {MAX_SIDE}", _is_side),
     "base": (f"a whole number of pixels, 1 to {MAX_SIDE}", _is_side),
-    "origin": ("a text", _is_text),
+    "origin": (
+        f"a text of at most {LONGEST_ORIGIN:,} characters",
+        lambda v: _is_text(v, LONGEST_ORIGIN),
+    ),
     "sha256": (
         "64 hexadecimal digits",
         lambda v: isinstance(v, str) and re.fullmatch("[0-9a-f]{64}", v) is not None,

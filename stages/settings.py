@@ -14,6 +14,8 @@ from chebsplat.formats.names import unprintable
 from chebsplat.settings import Section, number, seed, setting
 
 MAX_CHANNELS = 64  # that can be rendered
+NAMED_LATER = "teacher.model=MODEL.onnx,train.features=lifted"  # of a finished scene of colours
+FETCH = "chebsplat get-teacher segformer-b0-ade"  # which names photographs
 
 
 def printable(text: str) -> str:

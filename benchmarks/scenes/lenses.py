@@ -3,7 +3,7 @@
 Six rooms that nothing was chosen on, each as two lenses show it: four generated, and the two of the
 modelled house where the test data is there (CHEBSPLAT_TEST_DATA). A folder is what `unposed` takes:
 images/, and truth.json with each photo's camera-to-world matrix in metres. Photos carry no EXIF,
-and have noise.
+and have noise. A folder that exists is refused.
 """
 
 from __future__ import annotations
@@ -68,6 +68,8 @@ def main(arguments: Sequence[str]) -> int:
     for number, (name, K, views) in enumerate(rooms(options.views)):
         lenses = PAIRS[number % len(PAIRS)]
         folders = [options.out / f"{name}-{lens}" for lens in lenses]
+        if there := [folder for folder in folders if folder.exists()]:
+            parser.error(f"{there[0]} exists; remove it, or choose another --out")
         truth = {}
         for k, (image, pose) in enumerate(views):
             truth[f"photo_{k:03d}"] = pose.tolist()

@@ -14,7 +14,7 @@ from chebsplat.errors import InputError
 from chebsplat.formats.images import header, is_image
 from chebsplat.formats.manifest import Manifest, parse_manifest
 from chebsplat.formats.videos import describe
-from chebsplat.pipelines.planning.needs import FETCH, UNASKED
+from chebsplat.pipelines.planning.needs import UNASKED
 from chebsplat.pipelines.planning.plan import Plan, Step
 from chebsplat.pipelines.planning.raw import raw_files
 from chebsplat.pipelines.work import finished, store
@@ -22,6 +22,7 @@ from chebsplat.settings import default_steps
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.machine import processor
 from chebsplat.stages.runtime.progress import duration
+from chebsplat.stages.settings import FETCH
 from chebsplat.stages.sources.common import is_photo
 from chebsplat.stages.sources.generated import SIZES
 from chebsplat.stages.sources.video import MOST

@@ -23,6 +23,7 @@ from chebsplat.formats.teacher_model import (
 from chebsplat.formats.videos import is_video, require_av
 from chebsplat.pipelines.work import store
 from chebsplat.pipelines.work.scenes import expand_variables
+from chebsplat.stages.settings import FETCH, NAMED_LATER
 from chebsplat.stages.sources.common import unread
 from chebsplat.stages.teacher_models.text_encoder import PACKAGE, match_names
 
@@ -31,17 +32,13 @@ LIFTED = "train.features is lifted"
 PHOTOGRAPHS = ("photos", "colmap", "transforms", "seven_scenes", "video")
 POSELESS = ("photos", "video")  # kinds without poses
 UNASKED = "no 2D teacher is named"
-FETCH = "chebsplat get-teacher segformer-b0-ade"
 HOW = (
     f"to label photographs, fetch one with `{FETCH}` and name it by set=teacher.model=MODEL.onnx "
     "(docs/teachers.md); the embedded one (set=teacher.kind=embedded) was trained on generated "
     "rooms only"
 )
 
-LATER = (
-    "to name what is in it, without training again: the same command with "
-    "set=teacher.model=MODEL.onnx,train.features=lifted"
-)
+LATER = f"to name what is in it, without training again: the same command with set={NAMED_LATER}"
 
 
 def teacher_kind(config: Any, source: str, probe: dict[str, bool]) -> tuple[str, str]:

@@ -4,13 +4,15 @@ an ONNX file; and a trial of a teacher on an image before a scene: its settings,
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
 import re
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
@@ -33,6 +35,7 @@ from chebsplat.stages.teacher_models.label_space import closed_set, label_set, o
 from chebsplat.stages.tools.teacher_files import (
     ADDRESS,
     AGAIN,
+    copy,
     full_address,
     gather,
     stem_of,
@@ -52,6 +55,21 @@ STEPS = (  # of an image processor: those that keys of a TOML replace, and those
 N_LABELS, N_PHOTOS = 8, 8  # of a trial
 
 
+@contextmanager
+def _short_names() -> Iterator[None]:
+    """Raises ConfigError where a file's name is longer than the disk takes."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        raise ConfigError(
+            f"{Path(error.filename).name[:60]}... cannot be written ({error.strerror}); give it a "
+            "shorter name, or choose another --out"
+        ) from None
+
+
+@_short_names()
 def get_teacher(
     name: str,
     out: Path | None = None,
@@ -85,10 +103,10 @@ def get_teacher(
     folder = out or Path(short)
     model = folder / f"{short}.onnx"
     if folder.exists():
-        if not model.is_file() or read_teacher(model).origin != origin:
-            raise ConfigError(
-                f"{folder} exists and is not {origin}; remove it, or choose another --out"
-            )
+        other = not model.is_file() or read_teacher(model).origin != origin
+        if other or settings is not None:
+            why = f"is not {origin}" if other else f"keeps its TOML, whatever {settings} says"
+            raise ConfigError(f"{folder} exists and {why}; remove it, or choose another --out")
         compare(sha256, model, origin)
         return model, check(model)
     part = folder.with_name(f".part-{folder.name}")
@@ -137,12 +155,11 @@ def from_hub(repository: str, revision: str, graph: str, model: Path) -> dict[st
         for name in weight_files(files[graph])
     }
     shutil.copyfile(files[graph], model)
-    for name, file in weights.items():
-        (model.parent / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, model.parent / name)
     labels = model.with_suffix(".txt")
     classes = class_names(files[CLASSES], repository)
     labels.write_text("\n".join(classes) + "\n", encoding="utf-8")
+    for name, file in weights.items():
+        copy(str(file), model.parent / name, AGAIN)
     return {"output": "logits", "labels": labels.name} | preparation(files[PREPARATION], repository)
 
 

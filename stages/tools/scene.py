@@ -25,6 +25,7 @@ from chebsplat.render import SceneRenderer
 from chebsplat.splats.gaussians import surface_of
 from chebsplat.splats.rounded import rounded_light
 from chebsplat.splats.similarity import Similarity
+from chebsplat.stages.settings import FETCH, NAMED_LATER
 from chebsplat.stages.tools.query import Query, Relevancy, understood
 from chebsplat.stages.tools.up import up_of
 from chebsplat.views import View
@@ -166,9 +167,8 @@ class OpenedScene:
         if self.features is None:
             raise ConfigError(
                 f"{self.source} has colours alone: no 2D teacher has said what things are; make "
-                f"scene={shlex.quote(str(self.source))} set=teacher.model=MODEL.onnx,"
-                "train.features=lifted (chebsplat get-teacher segformer-b0-ade fetches one), of a "
-                "splat: chebsplat lift --capture"
+                f"scene={shlex.quote(str(self.source))} set={NAMED_LATER} ({FETCH} fetches one), "
+                "of a splat: chebsplat lift --capture"
             )
         if self._teacher is None:
             raise ConfigError(

@@ -16,8 +16,9 @@ from urllib.error import HTTPError, URLError
 from urllib.parse import quote, unquote, urljoin, urlsplit
 from urllib.request import Request, url2pathname, urlopen
 
-from chebsplat.errors import InputError
+from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats.files import regular
+from chebsplat.formats.names import unprintable
 from chebsplat.formats.onnx_files import is_graph, weight_files
 from chebsplat.formats.teacher_model import FILES, TEXT_PACKAGE, read_settings
 
@@ -33,8 +34,11 @@ def full_address(address: str) -> str:
 
 
 def stem_of(address: str) -> str:
-    """The name of its file without the ending."""
-    return _file(address).stem
+    """The name of its file without the ending. Raises ConfigError on an address without one."""
+    file = _file(address)
+    if urlsplit(address).path.endswith("/") or file.name in ("", "..") or unprintable(file.name):
+        raise ConfigError(f"{address} names no file; give the address of the .onnx itself")
+    return file.stem
 
 
 def gather(address: str, settings: str | None, graph: Path) -> dict[str, Any]:
@@ -74,16 +78,24 @@ def gather(address: str, settings: str | None, graph: Path) -> dict[str, Any]:
             check_graph(place, source)
             names = weight_files(place)
         for name in names:
-            (weights := place.parent / name).parent.mkdir(parents=True, exist_ok=True)
-            copy(_beside(source, name), weights, f"{source} keeps weights there: correct it")
+            copy(
+                _beside(source, name),
+                place.parent / name,
+                f"{source} keeps weights there: correct it",
+            )
     return values
 
 
 def copy(address: str, place: Path, remedy: str) -> None:
-    """A file from its address. Raises InputError, with the remedy where it is not there."""
+    """A file from its address, in folders made for it.
+
+    Raises: InputError, with the remedy where it is not there.
+    """
     path = _here(address)
-    if place.exists():
-        raise InputError(f"{address}: {place.name} is the name of two files; rename one")
+    there = next(each for each in (place, *place.parents) if each.exists())
+    if there == place or not there.is_dir():
+        raise InputError(f"{address}: {there.name} is the name of two files; rename one")
+    place.parent.mkdir(parents=True, exist_ok=True)
     if path is not None:
         regular(path, remedy)
         shutil.copyfile(path, place)

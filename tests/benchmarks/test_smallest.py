@@ -125,6 +125,14 @@ def test_a_lens_shows_each_point_where_its_equation_says(name):
     assert np.abs(photo[..., 0] - x).max() > 3
 
 
+def test_a_capture_that_exists_is_not_written_over(tmp_path, capsys):
+    (tmp_path / "office31001-phone").mkdir()
+    with pytest.raises(SystemExit, match="2"):
+        lenses.main(["--views", "1", "--out", str(tmp_path)])
+    assert "office31001-phone exists; remove it, or choose another" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.rglob("*")] == ["office31001-phone"]
+
+
 HELD = {"torch, 4 threads": 100.0, "cpu, 4 threads": 4.0, "cpu, 1 thread": 12.0,
         "cpu, 3 channels": 3.0, "cpu, 100k": 6.0, "training step, 3 colors": 10.0,
         "training step, 32 features by cell": 12.0}  # fmt: skip

@@ -308,6 +308,33 @@ def test_meanings_that_do_not_fit_are_refused(tmp_path, changed, word):
         read_semantics(path)
 
 
+@pytest.mark.parametrize("suffix", [".glb", ".spz"])
+@pytest.mark.parametrize("names", [[1, 2, 3], ["wall", "", "sofa"], ["wall", "sofa", "sofa"]])
+def test_class_names_that_are_none_are_refused(tmp_path, suffix, names):
+    path, told = tmp_path / f"a{suffix}", tmp_path / f"a{suffix}.labels.npz"
+    write_splats(path, given() | {"degrees": np.full(N, 3)}, meaning())
+    if suffix == ".glb":
+        document, binary = parts_of(path)
+        values = document["extensions"]["EXT_structural_metadata"]["schema"]["enums"]["label"]
+        for value, name in zip(values["values"][1:], names, strict=True):
+            value["name"] = name
+        glb_of(path, document, binary)
+    else:
+        with np.load(told) as stored:
+            arrays = dict(stored) | {"names": np.array(names)}
+        np.savez(told, **arrays)
+    with pytest.raises(InputError, match=rf"a\{suffix}.*: names of classes.*; .* or export"):
+        read_semantics(path)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".sog", ".glb"])  # SPZ refuses such a scene
+def test_sizes_beyond_float32_lose_no_gaussian(tmp_path, suffix):
+    p = given(0) | {"degrees": np.zeros(N, np.uint8)}
+    p["log_scales"][3], p["log_scales"][4, 0] = -120, 100
+    write_splats(tmp_path / f"a{suffix}", p)
+    assert len(read_splats(tmp_path / f"a{suffix}")[0]["means"]) == N
+
+
 def splats_of(document):
     return document["meshes"][0]["primitives"][0]
 

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from shared import data, run_stage
 
+from benchmarks.scenes import lenses
 from chebsplat.cameras import centers
 from chebsplat.errors import DataFailure
 from chebsplat.formats import artifact
@@ -22,12 +23,16 @@ from chebsplat.stages.settings import IngestSection, PoseSection
 from chebsplat.stages.sources import assembly, colmap, colmap_model, photos
 from chebsplat.stages.sources.cameras import FACES, Camera
 from chebsplat.stages.sources.common import Frame, Listing
+from chebsplat.stages.sources.generated import photograph
+from chebsplat.synthetic.mesh import Soup
+from chebsplat.synthetic.rays import RayCaster, intrinsics, walk
+from chebsplat.synthetic.shuffled import build
 
 GOOD = {
     "n_registered": 20, "n_given": 20, "n_in_others": [], "n_misplaced": 0, "n_points": 4000,
     "points_a_view": 400.0,
     "track_length": 4.0, "reprojection_error_px": 0.5, "reprojection_error": 4e-4,
-    "mapped_error": 5e-4,
+    "mapped_error": 5e-4, "focal_spread": 0.01,
     "pairs_agree": 0.95, "pairs_level": 0.1, "angle_degrees": 15.0,
 }  # fmt: skip
 
@@ -73,6 +78,7 @@ def test_photos_that_their_pairs_contradict_are_left_out_and_groups_that_hang_on
         ),
         ({"pairs_agree": 0.5}, "Only 50% of the pairs"),
         ({"mapped_error": 3e-3}, "lock focus and zoom"),
+        ({"focal_spread": 0.2}, "Focal lengths of the photos differ by 22%"),
         ({"points_a_view": 30.0}, "only 30 points"),
     ],
 )
@@ -314,6 +320,74 @@ def test_two_rooms_in_one_folder_are_told_apart(tmp_path):
     assert code == 4 or any(
         "groups" in doubt or "could not be placed" in doubt for doubt in model.judged["doubts"]
     )
+
+
+def with_a_mirror(room):
+    """The room whose wall of the largest x is a mirror: in its place the room again, mirrored."""
+    soup, width, flip = room.soup, room.size[0], np.diag([-1.0, 1, 1])
+    kept = (soup.vertices[soup.triangles][..., 0] < width - 1e-4).any(1)
+    beyond = np.array([2 * width, 0, 0])
+    room.soup = Soup(
+        np.r_[soup.vertices, soup.vertices @ flip + beyond].astype(np.float32),
+        np.r_[soup.triangles[kept], soup.triangles[kept] + len(soup.vertices)],
+        np.tile(soup.labels[kept], 2),
+        np.tile(soup.materials[kept], 2),
+        np.r_[soup.parts[kept], soup.parts[kept] + len(soup.origins)],
+        np.r_[soup.origins, soup.origins @ flip + beyond],
+        np.r_[soup.rotations, soup.rotations @ flip],
+    )
+    lights = room.lights.copy()
+    lights[:, 0] = lights[:, 0] @ flip + beyond
+    room.lights = np.r_[room.lights, lights]
+    return room
+
+
+@pytest.fixture(scope="module")
+def mirrored():
+    """A room with a mirror, K, poses of a walk around it, and its photos u8 [V, H, W, 3]."""
+    room, K = with_a_mirror(build("office", 31_001)), intrinsics(480, 360, 84.0)
+    caster = RayCaster(room.soup.vertices, room.soup.triangles)
+    poses = walk(room.size, 20, 31_001)
+    return room, K, poses, [photograph(room, caster, K, pose, 480, 360)[0] for pose in poses]
+
+
+PLAIN, ZOOMED = lenses.Lens(0, 0, 1.0), lenses.Lens(0, 0, 0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("sfm")
+@pytest.mark.parametrize(
+    ("lens_of", "right"),
+    [
+        (lambda k: PLAIN, True),
+        (lambda k: (PLAIN, ZOOMED)[k >= 10], False),  # zoomed halfway
+        (lambda k: (lenses.LENSES["action"], lenses.LENSES["zoom"])[k % 2], False),
+        (lambda k: lenses.Lens(0, 0, 1 - 0.015 * k), False),
+    ],
+    ids=["one lens", "zoomed halfway", "two lenses by turns", "a zoom that moves"],
+)
+def test_a_mirror_is_no_trouble_and_photos_of_two_lenses_are_not_passed_in_silence(
+    mirrored, lens_of, right, tmp_path
+):
+    room, K, exact, images = mirrored
+    (tmp_path / "photos").mkdir()
+    for k, image in enumerate(images):
+        photo = lenses.through(image.astype(np.float64), K, lens_of(k))
+        photo += np.random.default_rng(k).normal(0, lenses.NOISE, photo.shape)
+        Image.fromarray(photo.round().clip(0, 255).astype(np.uint8)).save(
+            tmp_path / f"photos/{k:02d}.png"
+        )
+    code, model, _ = posed(tmp_path / "photos", tmp_path / "model")
+    if not right:
+        assert code == 4 or any("lock focus and zoom" in doubt for doubt in model.judged["doubts"])
+        return
+    assert code == 0 and model.judged["doubts"] == [] and len(model.names) == len(images)
+    scale, rotation, shift = alignment(model.cam_from_world, exact)
+    eyes, points = (
+        scale * of @ rotation.T + shift for of in (centers(model.cam_from_world), model.points)
+    )
+    assert np.linalg.norm(eyes - centers(exact), axis=1).max() < 0.05  # metres, in a room of 4.7
+    assert (points[:, 0] > room.size[0] + 0.2).sum() > 20  # of the mirror's picture
 
 
 @pytest.mark.data

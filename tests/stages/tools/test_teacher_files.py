@@ -1,6 +1,7 @@
 """Teachers by the address of their ONNX file: a path, a file: URL, and a server of our own."""
 
 import os
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -9,7 +10,7 @@ from onnx import helper
 from served import Quiet, served
 from tiny_teachers import COLORS, color_teacher, moved_out, write_model
 
-from chebsplat.errors import ConfigError, InputError
+from chebsplat.errors import ChebsplatError, ConfigError, InputError
 from chebsplat.formats.onnx_files import model_sha256
 from chebsplat.formats.teacher_model import read_teacher
 from chebsplat.stages.tools.get_teacher import get_teacher
@@ -99,6 +100,8 @@ def test_what_brings_no_toml_takes_the_user_s_own(place, tmp_path):
         with pytest.raises(InputError, match=r"answers 404; write a TOML .* --settings FILE.toml"):
             get_teacher(f"{server}/tiny.onnx")
         model, _ = get_teacher(f"{server}/tiny.onnx", settings="../mine/tiny.toml")
+        with pytest.raises(ConfigError, match=r"tiny exists and keeps its TOML, .*remove it"):
+            get_teacher(f"{server}/tiny.onnx", settings="../mine/tiny.toml")
     assert read_teacher(model).labels.read_text().split() == list(COLORS)
 
 
@@ -124,7 +127,11 @@ def last_axes(path):
 
 def renamed_weights(path, name):
     moved_out(path, "weights.bin")
-    path.write_bytes(path.read_bytes().replace(b"weights.bin", name))
+    model = onnx.load(path, load_external_data=False)
+    tensors = [*model.graph.initializer, *(a.t for n in model.graph.node for a in n.attribute)]
+    for entry in (entry for tensor in tensors for entry in tensor.external_data):
+        entry.value = name if entry.key == "location" else entry.value
+    path.write_bytes(model.SerializeToString())
 
 
 REFUSED = {
@@ -145,12 +152,24 @@ REFUSED = {
         "keeps weights there",
     ),
     "weights of ours": (
-        lambda f: renamed_weights(f, b"../ghts.bin"),
+        lambda f: renamed_weights(f, "../ghts.bin"),
         r"^http\S*/tiny.onnx has weights outside",
     ),
     "weights of no name": (
-        lambda f: renamed_weights(f, b"weig\0ts/bin"),
+        lambda f: renamed_weights(f, "weig\0ts/bin"),
         r"^http\S*/tiny.onnx has weights outside",
+    ),
+    "weights at a location of nothing": (
+        lambda f: renamed_weights(f, ""),
+        r"^http\S*/tiny.onnx has weights .*in no file \('\.'\)",
+    ),
+    "weights in the folder itself": (
+        lambda f: renamed_weights(f, "a/.."),
+        r"^http\S*/tiny.onnx has weights .*in no file \('\.'\)",
+    ),
+    "weights below the TOML": (
+        lambda f: renamed_weights(f, "tiny.toml/x"),
+        "/x: tiny.toml is the name of two files; rename one",
     ),
     "a list of sides": (lambda f: toml(f, base="[1]"), r"^http\S*/tiny.toml: base = \[1\]"),
     "weights in the place of labels": (lambda f: moved_out(f, "tiny.labels.txt"), "of two files"),
@@ -175,11 +194,27 @@ def test_what_is_no_teacher_is_one_line_and_leaves_no_folder(place, tmp_path, ca
         ("http://127.0.0.1:9/tiny.tflite", "is TFLite, .*python -m tf2onnx.convert"),
         ("nowhere/tiny.onnx", "nowhere/tiny.toml is missing; write a TOML"),
         ("ftp://127.0.0.1/tiny.onnx", "is missing"),
+        *(
+            (f"http://127.0.0.1:9/{end}", "names no file; give the address of the .onnx itself")
+            for end in ("", "models/", "..", "%2e%2e", "?of=tiny.onnx", "a%00.onnx")
+        ),
+        (
+            f"http://127.0.0.1:9/{'x' * 300}.onnx",
+            r"^x+\.\.\. cannot be written .*give it a shorter name",
+        ),
+        (f"{'x' * 250}.onnx", r"^\.part-x+\.\.\. cannot be written"),
     ],
 )
 def test_what_is_not_reached_or_read_is_one_line(place, address, word):
-    with pytest.raises(InputError, match=word):
+    with pytest.raises(ChebsplatError, match=word) as error:
         get_teacher(address)
+    assert "\n" not in str(error.value) and not list(Path().iterdir())
+
+
+def test_an_address_as_long_as_a_presigned_one_is_kept(place):
+    with served(place.parent) as server:
+        model, _ = get_teacher(address := f"{server}/tiny.onnx?signature={'x' * 4000}")
+    assert read_teacher(model).origin == address
 
 
 @pytest.mark.parametrize(
