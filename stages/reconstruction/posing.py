@@ -6,6 +6,7 @@ Where the usual features and lens fail, more features are tried, and a fisheye's
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -125,11 +126,67 @@ def _mapped(
     job: Job, shots: Sequence[Shot], pictures: Path, database: Path, settings: PoseSection
 ) -> PhotoModel | None:
     """The largest model that mapping finds, in pixels of the photos; None where there is none."""
+    models, joint = _joined(job, len(shots), pictures, database, settings)
+    if not models:
+        return None
+    model, *others = models
+    misplaced = judge.misplaced(judge.pairs(model, database))
+    for identity in misplaced:
+        model.deregister_frame(model.images[identity].frame_id)
+    mapped_error = model.compute_mean_reprojection_error()
+    if settings.camera == "auto":
+        _free_second_term(model)
+    _refine(model)
+    sizes = [other.num_reg_images() for other in others]
+    judged = judge.judge_model(
+        model, judge.pairs(model, database), len(shots), sizes, len(misplaced), mapped_error, joint
+    )
+    return _collected(model, shots, judged)
+
+
+def _joined(
+    job: Job, n_photos: int, pictures: Path, database: Path, settings: PoseSection
+) -> tuple[list[pycolmap.Reconstruction], judge.Joint | None]:
+    """The models that mapping finds, and where the largest is joined wrongly all the same.
+
+    Choices: without the pairs that join it wrongly it is mapped again, as long as more of all pairs
+      agree for it.
+    """
+    models, rest = _models(job, n_photos, pictures, database, settings), job.scratch / "rest.db"
+    if not models:
+        return [], None
+    graph = judge.pairs(models[0], database, judge.FEW)
+    joint = judge.joint(graph)
+    if joint is not None:
+        shutil.copy(database, rest)
+    while joint is not None:
+        log.info(
+            "%d pairs of photos join two parts that %d others contradict; mapping without them",
+            joint.n_agree,
+            joint.n_against,
+        )
+        with pycolmap.Database.open(rest) as opened:
+            for pair in joint.pairs:
+                opened.delete_two_view_geometry(*pair)
+        again = _models(job, n_photos, pictures, rest, settings)
+        if not again:
+            break
+        tried = judge.pairs(again[0], database, judge.FEW)
+        if tried.n_agree <= graph.n_agree:
+            break
+        models, graph, joint = again, tried, judge.joint(tried)
+    return models, joint
+
+
+def _models(
+    job: Job, n_photos: int, pictures: Path, database: Path, settings: PoseSection
+) -> list[pycolmap.Reconstruction]:
+    """The models that mapping finds, largest first."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, settings.seed
     out = job.scratch / "mapped"
     out.mkdir(exist_ok=True)
-    with job.progress.ticker(len(shots), "poses") as registered:
+    with job.progress.ticker(n_photos, "poses") as registered:
 
         def first_pair() -> None:
             registered()
@@ -139,21 +196,7 @@ def _mapped(
             database, pictures, out, options,
             initial_image_pair_callback=first_pair, next_image_callback=registered,
         )  # fmt: skip
-    if not models:
-        return None
-    sizes = sorted((model.num_reg_images() for model in models.values()), reverse=True)
-    model = max(models.values(), key=lambda one: one.num_reg_images())
-    misplaced = judge.misplaced(judge.pairs(model, database))
-    for identity in misplaced:
-        model.deregister_frame(model.images[identity].frame_id)
-    mapped_error = model.compute_mean_reprojection_error()
-    if settings.camera == "auto":
-        _free_second_term(model)
-    _refine(model)
-    judged = judge.judge_model(
-        model, judge.pairs(model, database), len(shots), sizes[1:], len(misplaced), mapped_error
-    )
-    return _collected(model, shots, judged)
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
 
 def _free_second_term(model: pycolmap.Reconstruction) -> None:
