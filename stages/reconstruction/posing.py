@@ -126,7 +126,7 @@ def _mapped(
     job: Job, shots: Sequence[Shot], pictures: Path, database: Path, settings: PoseSection
 ) -> PhotoModel | None:
     """The largest model that mapping finds, in pixels of the photos; None where there is none."""
-    models, joint = _joined(job, len(shots), pictures, database, settings)
+    models = _joined(job, len(shots), pictures, database, settings)
     if not models:
         return None
     model, *others = models
@@ -139,49 +139,42 @@ def _mapped(
     _refine(model)
     sizes = [other.num_reg_images() for other in others]
     judged = judge.judge_model(
-        model, judge.pairs(model, database), len(shots), sizes, len(misplaced), mapped_error, joint
+        model, judge.pairs(model, database), len(shots), sizes, len(misplaced), mapped_error
     )
     return _collected(model, shots, judged)
 
 
 def _joined(
     job: Job, n_photos: int, pictures: Path, database: Path, settings: PoseSection
-) -> tuple[list[pycolmap.Reconstruction], judge.Joint | None]:
-    """The models that mapping finds, and where the largest is joined wrongly all the same.
+) -> list[pycolmap.Reconstruction]:
+    """The models that mapping finds, largest first.
 
-    Choices: without the pairs that join it wrongly it is mapped again, as long as more of all pairs
-      agree for it.
+    Choices: without pairs of photos that may join two parts of the largest wrongly it is mapped
+      again, which counts where more of all pairs then agree.
     """
-    models, rest = _models(job, n_photos, pictures, database, settings), job.scratch / "rest.db"
-    if not models:
-        return [], None
-    graph = judge.pairs(models[0], database, judge.FEW)
-    joint = judge.joint(graph)
-    if joint is not None:
-        shutil.copy(database, rest)
-    while joint is not None:
-        log.info(
-            "%d pairs of photos join two parts that %d others contradict; mapping without them",
-            joint.n_agree,
-            joint.n_against,
-        )
+    models: list[pycolmap.Reconstruction] = []
+    most, rest = -1, database
+    tried = _models(job, n_photos, pictures, database, settings)
+    while tried and (graph := judge.pairs(tried[0], database, judge.FEW)).n_agree > most:
+        models, most = tried, graph.n_agree
+        joint = judge.joint(graph)
+        if not joint:
+            break
+        log.info("%d pairs of photos may join two parts wrongly; mapping without them", len(joint))
+        if rest == database:
+            rest = job.scratch / "rest.db"
+            shutil.copy(database, rest)
         with pycolmap.Database.open(rest) as opened:
-            for pair in joint.pairs:
+            for pair in joint:
                 opened.delete_two_view_geometry(*pair)
-        again = _models(job, n_photos, pictures, rest, settings)
-        if not again:
-            break
-        tried = judge.pairs(again[0], database, judge.FEW)
-        if tried.n_agree <= graph.n_agree:
-            break
-        models, graph, joint = again, tried, judge.joint(tried)
-    return models, joint
+        tried = _models(job, n_photos, pictures, rest, settings)
+    return models
 
 
 def _models(
     job: Job, n_photos: int, pictures: Path, database: Path, settings: PoseSection
 ) -> list[pycolmap.Reconstruction]:
-    """The models that mapping finds, largest first."""
+    """The models that mapping finds by a database, largest first."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, settings.seed
     out = job.scratch / "mapped"

@@ -220,8 +220,7 @@ def test_the_page_shows_the_error_of_every_stage_and_what_stopping_earlier_would
             assert html.escape(figure, quote=True).replace("&#x27;", "&#39;") in page, stage
     told = page[page.index("What stopping earlier would have cost") :]
     assert all(
-        f"<td>{words}</td>" in told
-        for words in ("before training", "train", "lift", "refine")
+        f"<td>{words}</td>" in told for words in ("before training", "train", "lift", "refine")
     )
     assert (
         "not measured"

@@ -29,8 +29,8 @@ from chebsplat.stages.sources.cameras import FACES, Camera
 from chebsplat.stages.sources.common import Frame, Listing, Shot, file_of
 
 GOOD = {
-    "n_registered": 20, "n_given": 20, "n_in_others": [], "n_misplaced": 0, "torn": [],
-    "n_points": 4000, "points_a_view": 400.0,
+    "n_registered": 20, "n_given": 20, "n_in_others": [], "n_misplaced": 0, "n_points": 4000,
+    "points_a_view": 400.0,
     "track_length": 4.0, "reprojection_error_px": 0.5, "reprojection_error": 4e-4,
     "mapped_error": 5e-4,
     "pairs_agree": 0.95, "pairs_level": 0.1, "angle_degrees": 15.0,
@@ -76,23 +76,21 @@ def between(n, m):
     return [(i, 12 + j) for i in range(n) for j in range(m)]
 
 
+TWO = whole(0, 12) + whole(12, 12)
+
+
 @pytest.mark.parametrize(
-    ("found", "holding"),
+    ("found", "joining"),
     [
-        (pairs_of(24, whole(0, 12) + whole(12, 12) + between(2, 2), between(9, 9)[-20:]), 4),
-        (pairs_of(24, whole(0, 12) + whole(12, 12) + between(3, 3), between(9, 9)[-20:]), None),
-        (pairs_of(24, whole(0, 12) + whole(12, 12) + between(2, 2)), None),  # none contradicts
-        (pairs_of(24, whole(0, 24), [(0, 20), (1, 22), (7, 16)]), None),
-        (pairs_of(17, whole(0, 12) + whole(12, 5) + between(1, 1), between(9, 4)[-20:]), None),
+        (pairs_of(24, TWO + between(2, 2), between(9, 9)[-20:]), between(2, 2)),
+        (pairs_of(24, TWO + between(5, 5), between(9, 9)[-20:]), []),  # most agree
+        (pairs_of(24, TWO + between(2, 2)), []),
+        (pairs_of(24, whole(0, 24), [(0, 20), (1, 22), (7, 16)]), []),
+        (pairs_of(17, whole(0, 12) + whole(12, 5) + between(1, 1), between(9, 4)[-20:]), []),
     ],
 )
-def test_two_parts_are_joined_wrongly_where_most_pairs_between_them_contradict(found, holding):
-    joint = judge.joint(found)
-    if holding is None:
-        assert joint is None
-    else:
-        assert (joint.n_agree, joint.n_against) == (holding, 20)
-        assert joint.pairs == [(100 + i, 100 + j) for i, j in between(2, 2)]
+def test_pairs_are_doubted_that_join_two_parts_which_most_pairs_hold_apart(found, joining):
+    assert judge.joint(found) == [(100 + i, 100 + j) for i, j in joining]
 
 
 def two_parts(folder, repeats):
@@ -152,8 +150,8 @@ def test_parts_that_what_repeats_has_joined_are_joined_by_what_they_share(
     job = Job({}, Config(), tmp_path / "out", tmp_path)
     with caplog.at_level("INFO", "chebsplat"):
         model = posing._mapped(job, shots, tmp_path, database, PoseSection())
-    assert ("16 pairs of photos join two parts that 49 others contradict" in caplog.text) == repeats
-    assert len(model.names) == 24 and model.judged["torn"] == []
+    assert ("16 pairs of photos may join two parts wrongly" in caplog.text) == repeats
+    assert len(model.names) == 24 and model.judged["doubts"] == []
     scale, rotation, shift = alignment(model.cam_from_world, poses)
     found = scale * centers(model.cam_from_world) @ rotation.T + shift
     assert np.abs(found - centers(poses)).max() < 0.02  # metres where noise is .2 pixels
@@ -168,7 +166,6 @@ def test_parts_that_what_repeats_has_joined_are_joined_by_what_they_share(
             {"n_misplaced": 3, "n_registered": 17},
             "3 photos are left out that most of their matches contradict",
         ),
-        ({"torn": [8, 44]}, "hang together by 8 pairs of photos that 44 others contradict"),
         ({"pairs_agree": 0.5}, "Only 50% of the pairs"),
         ({"mapped_error": 3e-3}, "lock focus and zoom"),
         ({"points_a_view": 30.0}, "only 30 points"),
