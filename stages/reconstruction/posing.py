@@ -6,6 +6,7 @@ Where the usual features and lens fail, more features are tried, and a fisheye's
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Sequence
 from copy import copy
 from pathlib import Path
@@ -127,11 +128,66 @@ def _mapped(
     job: Job, shots: Sequence[Shot], pictures: Path, database: Path, settings: PoseSection
 ) -> PhotoModel | None:
     """The largest model that mapping finds, in pixels of the photos; None where there is none."""
+    models = _joined(job, len(shots), pictures, database, settings)
+    if not models:
+        return None
+    model, *others = models
+    misplaced = judge.misplaced(judge.pairs(model, database))
+    for identity in misplaced:
+        model.deregister_frame(model.images[identity].frame_id)
+    mapped_error = model.compute_mean_reprojection_error()
+    if settings.camera == "auto":
+        _free_second_term(model)
+    _refine(model)
+    sizes = [other.num_reg_images() for other in others]
+    judged = judge.judge_model(
+        model,
+        judge.pairs(model, database),
+        len(shots),
+        sizes,
+        len(misplaced),
+        mapped_error,
+        focal_spread(model),
+    )
+    return _collected(model, shots, judged)
+
+
+def _joined(
+    job: Job, n_photos: int, pictures: Path, database: Path, settings: PoseSection
+) -> list[pycolmap.Reconstruction]:
+    """The models that mapping finds, largest first.
+
+    Choices: without pairs of photos that may join two parts of the largest wrongly it is mapped
+      again, which counts where more of all pairs then agree.
+    """
+    models: list[pycolmap.Reconstruction] = []
+    most, rest = -1, database
+    tried = _models(job, n_photos, pictures, database, settings)
+    while tried and (graph := judge.pairs(tried[0], database, judge.FEW)).n_agree > most:
+        models, most = tried, graph.n_agree
+        joint = judge.joint(graph)
+        if not joint:
+            break
+        log.info("%d pairs of photos may join two parts wrongly; mapping without them", len(joint))
+        if rest == database:
+            rest = job.scratch / "rest.db"
+            shutil.copy(database, rest)
+        with pycolmap.Database.open(rest) as opened:
+            for pair in joint:
+                opened.delete_two_view_geometry(*pair)
+        tried = _models(job, n_photos, pictures, rest, settings)
+    return models
+
+
+def _models(
+    job: Job, n_photos: int, pictures: Path, database: Path, settings: PoseSection
+) -> list[pycolmap.Reconstruction]:
+    """The models that mapping finds by a database, largest first."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, settings.seed
     out = job.scratch / "mapped"
     out.mkdir(exist_ok=True)
-    with job.progress.ticker(len(shots), "poses") as registered:
+    with job.progress.ticker(n_photos, "poses") as registered:
 
         def first_pair() -> None:
             registered()
@@ -141,27 +197,7 @@ def _mapped(
             database, pictures, out, options,
             initial_image_pair_callback=first_pair, next_image_callback=registered,
         )  # fmt: skip
-    if not models:
-        return None
-    sizes = sorted((model.num_reg_images() for model in models.values()), reverse=True)
-    model = max(models.values(), key=lambda one: one.num_reg_images())
-    misplaced = judge.misplaced(judge.pairs(model, database))
-    for identity in misplaced:
-        model.deregister_frame(model.images[identity].frame_id)
-    mapped_error = model.compute_mean_reprojection_error()
-    if settings.camera == "auto":
-        _free_second_term(model)
-    _refine(model)
-    judged = judge.judge_model(
-        model,
-        judge.pairs(model, database),
-        len(shots),
-        sizes[1:],
-        len(misplaced),
-        mapped_error,
-        focal_spread(model),
-    )
-    return _collected(model, shots, judged)
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
 
 def _free_second_term(model: pycolmap.Reconstruction) -> None:

@@ -6,8 +6,10 @@ import json
 import shutil
 
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from shared import data, run_stage
 
 from benchmarks.scenes import lenses
@@ -16,13 +18,16 @@ from chebsplat.errors import DataFailure
 from chebsplat.formats import artifact
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.photo_model import PhotoModel
-from chebsplat.stages.reconstruction import judge
+from chebsplat.stages.reconstruction import judge, posing
 from chebsplat.stages.reconstruction.adjustment import alignment
+from chebsplat.stages.reconstruction.matching import all_pairs, empty_database
 from chebsplat.stages.reconstruction.posing import further
+from chebsplat.stages.runtime.command import Job
+from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.settings import IngestSection, PoseSection
 from chebsplat.stages.sources import assembly, colmap, colmap_model, photos
 from chebsplat.stages.sources.cameras import FACES, Camera
-from chebsplat.stages.sources.common import Frame, Listing
+from chebsplat.stages.sources.common import Frame, Listing, Shot, file_of
 from chebsplat.stages.sources.generated import photograph
 from chebsplat.synthetic.mesh import Soup
 from chebsplat.synthetic.rays import RayCaster, intrinsics, walk
@@ -65,6 +70,96 @@ def test_photos_that_their_pairs_contradict_are_left_out_and_groups_that_hang_on
     found, absent
 ):
     assert judge.misplaced(found) == [100 + k for k in absent]
+
+
+def whole(first, n):
+    """Pairs of n photos in a row, each with the six after it."""
+    return [(first + i, first + j) for i in range(n) for j in range(i + 1, min(i + 7, n))]
+
+
+def between(n, m):
+    return [(i, 12 + j) for i in range(n) for j in range(m)]
+
+
+TWO = whole(0, 12) + whole(12, 12)
+
+
+@pytest.mark.parametrize(
+    ("found", "joining"),
+    [
+        (pairs_of(24, TWO + between(2, 2), between(9, 9)[-20:]), between(2, 2)),
+        (pairs_of(24, TWO + between(5, 5), between(9, 9)[-20:]), []),  # most agree
+        (pairs_of(24, TWO + between(2, 2)), []),
+        (pairs_of(24, whole(0, 24), [(0, 20), (1, 22), (7, 16)]), []),
+        (pairs_of(17, whole(0, 12) + whole(12, 5) + between(1, 1), between(9, 4)[-20:]), []),
+    ],
+)
+def test_pairs_are_doubted_that_join_two_parts_which_most_pairs_hold_apart(found, joining):
+    assert judge.joint(found) == [(100 + i, 100 + j) for i, j in joining]
+
+
+def two_parts(folder, repeats):
+    """Shots of two parts of a room, twelve photos each, their poses [24, 4, 4], and a database of
+    features and matches. Seven photos of each part see 40 points between the parts. Where something
+    repeats, four others of each part see 90 points of their own part, matched as if the same.
+    """
+    rng, middles = np.random.default_rng(0), np.array([[-3.0, 0, 0], [3.0, 0, 0]])
+    poses = np.tile(np.eye(4), (24, 1, 1))
+    turns = np.tile(np.linspace(-0.6, 0.6, 12), 2)
+    poses[:, :3, :3] = Rotation.from_euler("y", turns[:, None]).as_matrix()
+    moved = middles.repeat(12, 0) + [[0, 0.3 * (-1) ** k, 0] for k in range(24)]
+    poses[:, :3, 3] = [0, 0, 6] - np.einsum("vij,vj->vi", poses[:, :3, :3], moved)
+    repeated = rng.uniform(-1.5, 1.5, (90, 3))
+    turned = repeated[:, [1, 2, 0]]
+    seen = [  # points, the first of their numbers, photos
+        (middles[0] + rng.uniform(-1.5, 1.5, (150, 3)), 0, range(12)),
+        (middles[1] + rng.uniform(-1.5, 1.5, (150, 3)), 150, range(12, 24)),
+        (rng.uniform(-0.5, 0.5, (40, 3)), 300, [*range(7), *range(12, 19)]),
+        (middles[0] + repeated, 340, range(8, 12)),
+        (middles[1] + turned, 340, range(20, 24)),
+    ]
+    features = [dict[int, np.ndarray]() for _ in poses]
+    for points, first, photos_of in seen if repeats else seen[:3]:
+        for photo in photos_of:
+            local = points @ poses[photo, :3, :3].T + poses[photo, :3, 3]
+            pixels = 400 * local[:, :2] / local[:, 2:] + [400, 300]
+            features[photo] |= dict(enumerate(pixels + rng.normal(0, 0.2, pixels.shape), first))
+    files = [file_of(photo) for photo in range(24)]
+    for file in files:
+        Image.new("RGB", (800, 600)).save(folder / file)
+    database = empty_database(folder / "database.db")
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model, reader.camera_params = "SIMPLE_RADIAL", "400,400,300,0"
+    pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, files, reader)
+    with pycolmap.Database.open(database) as opened:
+        ids = [opened.read_image_with_name(file).image_id for file in files]
+        for photo, pixels in enumerate(features):
+            opened.write_keypoints(ids[photo], np.array(list(pixels.values()), np.float32))
+        for i, j in all_pairs(24):
+            _, rows, others = np.intersect1d(
+                list(features[i]), list(features[j]), return_indices=True
+            )
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+            geometry.inlier_matches = np.stack([rows, others], 1).astype(np.uint32)
+            if len(rows):
+                opened.write_two_view_geometry(ids[i], ids[j], geometry)
+    return [Shot(file, folder / file, (800, 600)) for file in files], poses, database
+
+
+@pytest.mark.parametrize("repeats", [True, False])
+def test_parts_that_what_repeats_has_joined_are_joined_by_what_they_share(
+    repeats, tmp_path, caplog
+):
+    shots, poses, database = two_parts(tmp_path, repeats)
+    job = Job({}, Config(), tmp_path / "out", tmp_path)
+    with caplog.at_level("INFO", "chebsplat"):
+        model = posing._mapped(job, shots, tmp_path, database, PoseSection())
+    assert ("16 pairs of photos may join two parts wrongly" in caplog.text) == repeats
+    assert len(model.names) == 24 and model.judged["doubts"] == []
+    scale, rotation, shift = alignment(model.cam_from_world, poses)
+    found = scale * centers(model.cam_from_world) @ rotation.T + shift
+    assert np.abs(found - centers(poses)).max() < 0.02  # metres where noise is .2 pixels
 
 
 @pytest.mark.parametrize(
