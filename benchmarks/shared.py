@@ -15,11 +15,11 @@ import numba
 import torch
 
 import chebsplat
-from chebsplat.kernels.threads import n_threads
+from chebsplat.kernels.threads import cores, n_threads
 from chebsplat.pipelines.planning.plan import Plan, Planner
 from chebsplat.pipelines.running.run import execute
 from chebsplat.pipelines.work.scenes import data_of
-from chebsplat.stages.runtime.machine import cores, load, processor
+from chebsplat.stages.runtime.machine import load, processor
 
 Bar = tuple[str, float, str, float]  # what, value, ">=" or "<=", bar
 

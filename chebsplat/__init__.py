@@ -11,10 +11,8 @@ import os
 from importlib import import_module
 from typing import Any
 
-# Idle OpenMP threads must sleep: spinning ones cost an order of magnitude on a busy machine. But
-# not at once: a few microseconds of waiting spare most wake-ups, a third of a training step, and
-# cost a busy machine nothing measurable.
-# Must precede torch.
+# Idle OpenMP threads of torch must sleep: spinning ones cost an order of magnitude on a busy
+# machine. But not at once: a few microseconds of waiting spare most wake-ups. Must precede torch.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 # onnxruntime writes an id of the machine into the home folder and reports to its maker, from its

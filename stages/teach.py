@@ -20,7 +20,7 @@ from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats.channels import ChannelMap
 from chebsplat.formats.knowledge import Knowledge, write_knowledge
 from chebsplat.formats.teacher_model import EMBEDDED, TeacherModel, read_label_table, read_teacher
-from chebsplat.kernels.threads import n_threads
+from chebsplat.kernels.threads import n_threads, set_n_threads
 from chebsplat.labels.decode import decode_labels
 from chebsplat.settings import DescribeSection
 from chebsplat.shape import point_encoder
@@ -191,8 +191,9 @@ def prepare_rooms(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[
     if len(missing) < len(seeds):
         job.watch.go_on(job.scratch)
     if missing:
-        os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the processes below
         context = multiprocessing.get_context("spawn")
+        set_n_threads(n_threads())  # of this process; the others have one each
+        os.environ["OMP_NUM_THREADS"] = "1"
         with ProcessPoolExecutor(n_threads(), mp_context=context) as pool:
             jobs = [pool.submit(prepare, folder, seed, settings, matrix) for seed in missing]
             for finished, _ in job.progress.track(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from typing import Any
 
+import torch
+
 from chebsplat.errors import DataFailure
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.gaussians import Gaussians
@@ -25,6 +27,14 @@ def run(job: Job) -> None:
     Reads `capture`, `points` and, with semantics, `features`; in a sequence, the `gaussians` of the
     scene before. Writes `gaussians`.
     """
+    threads = torch.get_num_threads()
+    try:
+        _train(job)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(job: Job) -> None:
     inputs = read_inputs(job)
     trainer = assemble(job, inputs)
     points, features, n_initial = inputs.points, inputs.features, len(trainer.model)

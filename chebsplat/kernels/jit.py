@@ -199,8 +199,8 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 # No fast-math but contraction: NaN and infinity keep their meaning. Not reassociation either, for
 # kernels just compiled then differ in the last bit from the same ones read from the cache.
-kernel: Any = _compiled(fastmath={"contract", "nsz"}, nogil=True)  # that `threads` may share
-body: Any = _compiled(fastmath={"contract", "nsz"})  # of a kernel
+kernel: Any = _compiled(fastmath={"contract", "nsz"}, nogil=True)  # may run in threads
+body: Any = _compiled(fastmath={"contract", "nsz"})  # part of a kernel
 lanes: Any = _compiled(fastmath={"contract"})  # of explicit vectors and their scalars
 serial: Any = _compiled()
 plain: Any = numba.extending.register_jitable  # a small function that Python calls, too

@@ -22,17 +22,22 @@ _workers: list[Worker] = []
 _count = 0
 
 
+def cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def n_threads() -> int:
     """Threads that a kernel may use: OMP_NUM_THREADS where it is set, else all allowed cores."""
-    if _count:
-        return _count
     wanted = os.environ.get("OMP_NUM_THREADS", "")
-    return int(wanted) if wanted.isdigit() and int(wanted) else len(os.sched_getaffinity(0))
+    return _count or (int(wanted) if wanted.isdecimal() and int(wanted) else cores())
 
 
 def set_n_threads(count: int) -> None:
     """Let kernels use so many threads from now on; 0: as the environment says."""
     global _count
+    if count < 0:
+        raise ValueError(f"{count} threads")
     _count = count
 
 
@@ -51,9 +56,11 @@ def in_every_thread(kernel: Kernel, *arguments: Any) -> None:
 
 
 def _run(kernel: Kernel, calls: Sequence[Sequence[Any]]) -> None:
-    """The first call in this thread, the others in workers. Raises the first failure."""
-    from chebsplat.kernels.waiting import wait_a_moment
+    """The first call in this thread, the others in workers. Raises the first failure.
 
+    Choices: an interrupt waits for the workers, which write into arrays of the caller's. A kernel
+      that calls this itself would wait for ever.
+    """
     others = calls[1:]
     while len(_workers) < len(others):
         _workers.append(Worker())
@@ -61,9 +68,12 @@ def _run(kernel: Kernel, calls: Sequence[Sequence[Any]]) -> None:
     failures: SimpleQueue[BaseException | None] = SimpleQueue()
     for k, arguments in enumerate(others):
         _workers[k].take(kernel, arguments, failures, finished[k : k + 1])
-    first = _attempt(kernel, calls[0])
-    wait_a_moment(finished, 1)
-    for failure in [first, *[failures.get() for _ in others]]:
+    try:
+        kernel(*calls[0])
+        _wait_a_moment(finished, 1)
+    finally:
+        failed = [failures.get() for _ in others]
+    for failure in failed:
         if failure is not None:
             raise failure
 
@@ -82,21 +92,26 @@ class Worker:
         self.taken += 1
 
     def _work(self) -> None:
-        from chebsplat.kernels.waiting import wait_a_moment
-
         for number in itertools.count(1):
-            wait_a_moment(self.taken, number)
-            kernel, arguments, failures, finished = self.jobs.get()
-            failures.put(_attempt(kernel, arguments))
-            finished[0] = 1
+            _wait_a_moment(self.taken, number)
+            self._do(*self.jobs.get())
+
+    def _do(self, kernel: Kernel, arguments: Sequence[Any], failures: Any, done: Any) -> None:
+        failure = None
+        try:
+            kernel(*arguments)
+        except BaseException as error:
+            failure = error
+        failures.put(failure)
+        done[0] = 1
 
 
-def _attempt(kernel: Kernel, arguments: Sequence[Any]) -> BaseException | None:
-    try:
-        kernel(*arguments)
-    except BaseException as error:
-        return error
-    return None
+def _wait_a_moment(counters: np.ndarray, least: int) -> None:
+    from chebsplat.kernels.waiting import (
+        wait_a_moment,  # compiled: who counts threads needs no numba
+    )
+
+    wait_a_moment(counters, least)
 
 
 # a forked process has none of its parent's threads

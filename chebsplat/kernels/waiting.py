@@ -1,6 +1,4 @@
-"""Waits of a few microseconds without Python's lock: to put a thread to sleep and to wake it takes
-as long as many a kernel.
-"""
+"""Short waits without Python's lock: many a kernel ends before a thread that sleeps is awake."""
 
 from llvmlite import ir
 from numba.core import types
@@ -9,7 +7,7 @@ from numba.core.typing.templates import signature
 from chebsplat.kernels.jit import kernel
 from chebsplat.kernels.simd import address, intrinsic
 
-TURNS = 50_000  # of looking, about a nanosecond each
+LOOKS = 50_000  # at most, of half a nanosecond and more
 
 
 @intrinsic
@@ -25,8 +23,8 @@ def look(_typing, counters, at):
 
 @kernel
 def wait_a_moment(counters, least):
-    """Wait until all counters i64 are at least `least`, and no longer than TURNS."""
-    for _ in range(TURNS):
+    """Wait until all counters i64 are at least `least`, for no more than LOOKS at one of them."""
+    for _ in range(LOOKS // max(len(counters), 1)):
         ready = True
         for k in range(len(counters)):
             ready &= look(counters, k) >= least

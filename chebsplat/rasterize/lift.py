@@ -114,8 +114,8 @@ def _lift(
     for band, starts in enumerate(bins.pair_starts):
         first, last = (band_start(k, rows) * columns for k in (band, band + 1))
         in_every_thread(
-            _fill_records, np.full(1, first), last, int(starts[0]), splats, bins.tile_starts,
-            bins.rank, bins.pair, values, counts, width, height, gate, records,
+            _fill_records, np.full(1, first, np.int64), last, int(starts[0]), splats,
+            bins.tile_starts, bins.rank, bins.pair, values, counts, width, height, gate, records,
         )  # fmt: skip
         in_parts(_add_records, len(sums), records, starts, sums)
     return sums

@@ -180,9 +180,10 @@ def backward(
     to_cell_colors = np.zeros((n, cell_columns), np.float32)
     for band, starts in enumerate(pair_starts):
         in_every_thread(
-            _fill_records, np.full(1, tiles[band]), tiles[band], tiles[band + 1], int(starts[0]),
-            int(n_pairs[band]), splats, tile_starts, ranks, pair, masks, used, max_alpha, width,
-            height, channels, flat, grad_means, flat_alpha, absolute, records, finite,
+            _fill_records, np.full(1, tiles[band], np.int64), tiles[band], tiles[band + 1],
+            int(starts[0]), int(n_pairs[band]), splats, tile_starts, ranks, pair, masks, used,
+            max_alpha, width, height, channels, flat, grad_means, flat_alpha, absolute, records,
+            finite,
         )  # fmt: skip
         in_parts(_add_records, len(order), records, starts, order, channels, sums, to_colors,
                  to_cell_colors)  # fmt: skip

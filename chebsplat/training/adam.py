@@ -15,19 +15,22 @@ TINY = 1e-15  # added to the root of the mean square
 
 
 def adam(groups: list[dict[str, Any]]) -> torch.optim.Adam:
-    """Of groups of parameters: torch's fused one on a GPU, and that of the kernel on the CPU."""
-    if groups[0]["params"][0].device.type == "cpu":
-        return KernelAdam(groups, eps=TINY)
+    """Of groups of parameters: torch's fused one on a GPU, the kernel's for float32 on the CPU."""
+    parameters = [parameter for group in groups for parameter in group["params"]]
+    if all(p.device.type == "cpu" and p.dtype == torch.float32 for p in parameters):
+        return KernelAdam(groups)
     return torch.optim.Adam(groups, eps=TINY, fused=True)
 
 
 class KernelAdam(torch.optim.Adam):
-    """Adam of float32 on the CPU, with torch's own state and settings.
+    """Adam of contiguous float32 on the CPU, with torch's own state and default settings.
 
-    Choices: torch's threads cost more than they spare in a training's many small operations (see
-      `stages.training.assembly`), so its own fused step has one. The same bits for any number of
-      the kernel's threads.
+    Choices: a training gives torch one thread (`stages.training.assembly`), and this step is long
+      enough to be worth more. The same bits for any number of the kernel's threads.
     """
+
+    def __init__(self, groups: list[dict[str, Any]]):
+        super().__init__(groups, eps=TINY)
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> None:  # type: ignore[override]
@@ -51,6 +54,7 @@ class KernelAdam(torch.optim.Adam):
                 count = state["step"].item()
                 size = np.float32(rate / (1 - betas[0] ** count))
                 scale = np.float32(1 / math.sqrt(1 - betas[1] ** count))
-                tensors = parameter, parameter.grad, state["exp_avg"], state["exp_avg_sq"]
+                moments = state["exp_avg"], state["exp_avg_sq"]
+                tensors = parameter, parameter.grad.contiguous(), *moments
                 flat = [tensor.view(-1).numpy() for tensor in tensors]
                 in_parts(update, len(flat[0]), *flat, size, scale, tiny, *shares)

@@ -46,7 +46,7 @@ class Trainer:
     The model's device computes; views and cameras must be there, too. On a GPU one step in
     READ_EVERY waits for its figures, the others for nothing: within these a loss that is not finite
     is found. `state_dict()` between two steps holds all that the steps to come depend on: a trainer
-    that loads it takes them as this one does, to the bit, with as many threads.
+    that loads it takes them as this one does, to the bit, with as many threads of torch.
     """
 
     def __init__(self, model: SceneModel, views: Views, settings: TrainSection, extent: float):

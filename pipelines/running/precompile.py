@@ -91,15 +91,17 @@ def colors() -> None:
 
 
 def losses() -> None:
-    """Photometric and feature losses."""
+    """Photometric and feature losses, and a step of Adam."""
     import torch
 
+    from chebsplat.training.adam import adam
     from chebsplat.training.losses import feature_distance, photometric
 
     render = torch.rand(HEIGHT, WIDTH, 3, requires_grad=True)
     photometric(render, torch.rand(HEIGHT, WIDTH, 3), None, 0.2).backward()
     features = torch.rand(HEIGHT // 4, WIDTH // 4, CHANNELS, requires_grad=True)
     feature_distance(features, torch.rand(HEIGHT // 4, WIDTH // 4, CHANNELS)).backward()
+    adam([{"params": [render]}]).step()
 
 
 def regions() -> None:

@@ -240,9 +240,9 @@ def _adjusting() -> pycolmap.BundleAdjustmentOptions:
 def focal_spread(model: pycolmap.Reconstruction) -> float:
     """Range of the middle 80 % of the photos' focal lengths, in ln, if each photo had its own.
 
-    Choices: a copy is adjusted in which each photo has a camera, whose focal length alone is free.
-      The model's own cameras hide a zoom that moves: poses make up for it, by centimetres, and
-      points still fit. Photos of all directions have no focal length, and spread by 0.
+    Choices: a copy is adjusted in which each photo has a camera of its own, of free focal length
+      and fixed distortion. The model's own cameras hide a zoom that moves: poses make up for it, by
+      centimetres, and points still fit. Photos of all directions have no focal length, and spread by 0.
     """
     free = pycolmap.Reconstruction()
     shared = {}
@@ -263,7 +263,7 @@ def focal_spread(model: pycolmap.Reconstruction) -> float:
     ratios = [
         free.cameras[identity].mean_focal_length() / camera.mean_focal_length()
         for identity, camera in shared.items()
-        if camera.focal_length_idxs()
+        if camera.focal_length_idxs() and free.cameras[identity].mean_focal_length() > 0
     ]
     low, high = np.quantile(np.log(ratios or [1.0]), (0.1, 0.9))
     return float(high - low)

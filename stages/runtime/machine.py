@@ -13,6 +13,7 @@ from typing import Any
 
 from chebsplat.errors import InputError
 from chebsplat.formats.files import atomic_write, parse_json
+from chebsplat.kernels.threads import cores
 
 log = logging.getLogger("chebsplat")
 CPUS = Path("/proc/cpuinfo")  # which has no names on ARM
@@ -29,11 +30,6 @@ def processor() -> str:
     from llvmlite.binding import get_host_cpu_name
 
     return str(get_host_cpu_name())
-
-
-def cores() -> int:
-    """Cores that this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def load() -> float:

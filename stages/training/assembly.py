@@ -20,6 +20,7 @@ from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.points import Points, thinned
 from chebsplat.formats.splats import read_splats
 from chebsplat.formats.world import HERE, World
+from chebsplat.kernels.threads import n_threads
 from chebsplat.settings import DescribeSection, TrainSection
 from chebsplat.splats.gaussians import initial_gaussians, sh0_of, surface_of
 from chebsplat.stages.runtime.command import Job
@@ -75,9 +76,9 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
     train = resolved(job.config.train, replace(evidence, exposure_spread=stops))
     job.facts["decided"] = decided(job.config.train, train, features is not None)
     _note_left_out(job, train, features is not None, evidence.no_depth)
-    # Of a step's many small operations the kernels have the long ones, and threads of their own;
-    # where others use the machine, too, torch's wait for each other after each of the rest.
-    torch.set_num_threads(1)
+    # Our method's long operations are kernels, with threads of their own. What is left to torch is
+    # short, and its threads wait for each other every time: for long on a shared machine.
+    torch.set_num_threads(1 if train.method == "ours" else n_threads())
     model = model_of(points, features, train, job.config.describe, job.device, backend, capture)
     undone = exposures if train.exposure == "measured" else None
     if undone is not None:

@@ -21,8 +21,8 @@ LAYOUT = 3  # of a state: one of another layout is not resumed
 class Saves:
     """Saves of the state of one training in the job's scratch folder; the last one stays.
 
-    A state fits only the same settings, inputs, package versions and device: otherwise the training
-    starts anew, with a warning.
+    A state fits only the same settings, inputs, package versions, device and number of torch's
+    threads: otherwise the training starts anew, with a warning.
     """
 
     def __init__(self, job: Job):
@@ -35,6 +35,7 @@ class Saves:
                 "config": settings,
                 "device": job.device,
                 "versions": versions,
+                "threads": torch.get_num_threads(),
                 "layout": LAYOUT,
             }
         )

@@ -30,7 +30,7 @@ def test_every_number_belongs_to_one_part(threads, n):
     assert max(last - first for first, last, _ in parts) <= -(-n // threads)
 
 
-def test_each_thread_calls_once(threads):
+def test_there_is_a_call_for_each_thread(threads):
     calls = []
     in_every_thread(calls.append, "once")
     assert calls == ["once"] * threads
