@@ -242,7 +242,8 @@ def focal_spread(model: pycolmap.Reconstruction) -> float:
 
     Choices: a copy is adjusted in which each photo has a camera of its own, of free focal length
       and fixed distortion. The model's own cameras hide a zoom that moves: poses make up for it, by
-      centimetres, and points still fit. Photos of all directions have no focal length, and spread by 0.
+      centimetres, and points still fit. Photos of all directions have no focal length, and spread
+      by 0.
     """
     free = pycolmap.Reconstruction()
     shared = {}
