@@ -29,8 +29,8 @@ def cores() -> int:
 
 def n_threads() -> int:
     """Threads that a kernel may use: OMP_NUM_THREADS where it is set, else all allowed cores."""
-    wanted = os.environ.get("OMP_NUM_THREADS", "")
-    return _count or (int(wanted) if wanted.isdecimal() and int(wanted) else cores())
+    setting = os.environ.get("OMP_NUM_THREADS", "")
+    return _count or (int(setting) if setting.isdecimal() and int(setting) else cores())
 
 
 def set_n_threads(count: int) -> None:
@@ -96,14 +96,14 @@ class Worker:
             _wait_a_moment(self.taken, number)
             self._do(*self.jobs.get())
 
-    def _do(self, kernel: Kernel, arguments: Sequence[Any], failures: Any, done: Any) -> None:
+    def _do(self, kernel: Kernel, arguments: Sequence[Any], failures: Any, mark: Any) -> None:
         failure = None
         try:
             kernel(*arguments)
         except BaseException as error:
             failure = error
         failures.put(failure)
-        done[0] = 1
+        mark[0] = 1
 
 
 def _wait_a_moment(counters: np.ndarray, least: int) -> None:
