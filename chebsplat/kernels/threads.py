@@ -84,6 +84,7 @@ class Worker:
     def __init__(self) -> None:
         self.jobs: SimpleQueue[tuple[Any, ...]] = SimpleQueue()
         self.taken = np.zeros(1, np.int64)  # jobs so far
+        _wait_a_moment(self.taken, 0)  # what cannot be compiled fails here, and not in the thread
         threading.Thread(target=self._work, daemon=True, name="kernels").start()
 
     def take(self, *job: Any) -> None:
@@ -107,9 +108,7 @@ class Worker:
 
 
 def _wait_a_moment(counters: np.ndarray, least: int) -> None:
-    from chebsplat.kernels.waiting import (
-        wait_a_moment,  # compiled: who counts threads needs no numba
-    )
+    from chebsplat.kernels.waiting import wait_a_moment  # of numba, which counting needs not
 
     wait_a_moment(counters, least)
 
