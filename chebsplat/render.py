@@ -13,36 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from chebsplat.kernels.dispatch import one_torch_thread
 from chebsplat.rasterize import binning, ellipses, rasterize, tiles
 from chebsplat.rasterize.cuda import made_harmless
 from chebsplat.rasterize.depths import depths
 from chebsplat.splats.gaussians import activated, surface_of, take
 from chebsplat.splats.planes import inverse_depths
 from chebsplat.splats.sh import eval_sh
+from chebsplat.splats.sh_kernels import colors_by_degree
 from chebsplat.views import View, in_frustum
 
 PARTS = ("projection", "sh", "sort", "blend")
 NEAR, FAR, BLUR, MAX_ALPHA = 0.01, 1e10, 0.3, 0.99  # the defaults of `rasterize`
-
-
-def colors_by_degree(sh0: Tensor, shN: Tensor, directions: Tensor, degrees: Tensor) -> Tensor:
-    """Colours [N, 3] of Gaussians sorted by ascending degree, each bucket by its own bands only.
-
-    Raises: ValueError if `degrees` [N] does not ascend.
-    Choices: on a GPU all bands of all, those above a degree being zero: a bucket costs more there
-      than it saves.
-    """
-    if sh0.device.type == "cuda":
-        return eval_sh(sh0, shN, directions, math.isqrt(shN.shape[1] + 1) - 1)
-    if len(degrees) > 1 and (degrees.diff() < 0).any():
-        raise ValueError("Gaussians are not sorted by degree")
-    values, counts = torch.unique_consecutive(degrees.int(), return_counts=True)
-    parts, start = [sh0.new_zeros(0, 3)], 0
-    for degree, count in zip(values.tolist(), counts.tolist(), strict=True):
-        rows = slice(start, start + count)
-        parts.append(eval_sh(sh0[rows], shN[rows], directions[rows], degree))
-        start += count
-    return torch.cat(parts)
 
 
 def focals(Ks: Tensor | np.ndarray) -> np.ndarray:
@@ -87,10 +69,14 @@ class SceneRenderer:
     def colors(self, view: View, index: Tensor | None) -> Tensor:
         """Colours [V, 3] of these Gaussians (None: of all) as the view's camera sees them."""
         eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-        sh0, shN, degrees = (take(self.raw[name], index) for name in ("sh0", "shN", "degrees"))
-        return colors_by_degree(sh0, shN, take(self.means, index) - eye, degrees)
+        sh0, shN = self.raw["sh0"], self.raw["shN"]
+        if index is not None:
+            return colors_by_degree(sh0, shN, self.raw["degrees"], index, self.means, eye)
+        # all bands of all, those above a degree being zero: to choose costs more on a GPU
+        return eval_sh(sh0, shN, self.means - eye, math.isqrt(shN.shape[1] + 1) - 1)
 
     @torch.no_grad()
+    @one_torch_thread()
     def render(
         self, view: View, with_features: bool = False
     ) -> tuple[np.ndarray, np.ndarray | None]:
@@ -141,6 +127,7 @@ class SceneRenderer:
 
 
 @torch.no_grad()
+@one_torch_thread()
 def frame_parts(renderer: SceneRenderer, view: View) -> tuple[dict[str, float], np.ndarray]:
     """Seconds of each of PARTS for one frame in colour alone, and the frame, u8 [H, W, 3], as
     `render` gives it.
@@ -166,9 +153,7 @@ def frame_parts(renderer: SceneRenderer, view: View) -> tuple[dict[str, float], 
     projected = ellipses.project(means.numpy(), quats.numpy(), scales.numpy(), *camera)
     centers, covariances, whitening, _, depths, radii, _ = projected
     clock.append(time.perf_counter())
-    eye = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
-    sh0, shN, degrees = (renderer.raw[name][index] for name in ("sh0", "shN", "degrees"))
-    colors = colors_by_degree(sh0, shN, means - eye, degrees).contiguous().numpy()
+    colors = renderer.colors(view, index).numpy()
     clock.append(time.perf_counter())
     strengths, size, none = opacities.numpy(), (view.width, view.height), colors[:, :0]
     bins = binning.bin_gaussians(

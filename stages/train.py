@@ -5,12 +5,11 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-import torch
-
 from chebsplat.errors import DataFailure
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.world import World
+from chebsplat.kernels.dispatch import one_torch_thread
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.training.assembly import KNOWLEDGE, assemble, read_inputs
 from chebsplat.stages.training.facts import facts_of, printed_facts
@@ -21,20 +20,13 @@ from chebsplat.training.printed import PrintedScene
 log = logging.getLogger("chebsplat")
 
 
+@one_torch_thread()  # or as many as `assemble` says; afterwards as many as before
 def run(job: Job) -> None:
     """Optimise Gaussians and their semantics (Eqs 11-13; docs/method.md, sections 3 to 8).
 
     Reads `capture`, `points` and, with semantics, `features`; in a sequence, the `gaussians` of the
     scene before. Writes `gaussians`.
     """
-    threads = torch.get_num_threads()
-    try:
-        _train(job)
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _train(job: Job) -> None:
     inputs = read_inputs(job)
     trainer = assemble(job, inputs)
     points, features, n_initial = inputs.points, inputs.features, len(trainer.model)

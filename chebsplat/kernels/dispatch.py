@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -18,6 +20,21 @@ def is_compiled(tensor: Tensor, backend: str = "auto") -> bool:
     if backend not in BACKENDS:
         raise ValueError(f"backend {backend!r} is none of {', '.join(BACKENDS)}")
     return backend != "reference" and tensor.device.type == "cpu" and tensor.dtype == torch.float32
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Torch computes on one thread within the block, or the function that this decorates.
+
+    Choices: threads of torch that wait for its next operation take cores from the kernels' threads,
+      and these from torch's: short operations of both in turns are fastest on one thread of torch.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def gsplat() -> Any:

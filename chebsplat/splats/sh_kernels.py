@@ -111,6 +111,32 @@ def _backward(
                 to_bands[v, 2] += _band(values, 9, sh3, i, c) * g
 
 
+@kernel
+def _by_degree(first, last, sh0, shN, degrees, index, means, eye, out):
+    values = np.empty(16)
+    for v in range(first, last):
+        i = index[v]
+        _basis(means, eye, i, degrees[i], values)
+        for c in range(3):
+            total = 0.5 + values[0] * sh0[i, 0, c]
+            for k in range((degrees[i] + 1) ** 2 - 1):
+                total += values[k + 1] * shN[i, k, c]
+            out[v, c] = max(total, 0.0)
+
+
+def colors_by_degree(
+    sh0: Tensor, shN: Tensor, degrees: Tensor, index: Tensor, means: Tensor, eye: Tensor
+) -> Tensor:
+    """Colours [V, 3] of the Gaussians `index` as seen from `eye` [3], each by its own bands only.
+
+    Args: sh0 [N, 1, 3], shN [N, K, 3], means [N, 3] float32 on the CPU; degrees [N].
+    """
+    out = np.empty((len(index), 3), np.float32)
+    arrays = [tensor.contiguous().numpy() for tensor in (sh0, shN, degrees, index, means, eye)]
+    in_parts(_by_degree, len(out), *arrays, out)
+    return torch.from_numpy(out)
+
+
 class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, sh0, sh1, sh2, sh3, masks, index, means, eye, degree):

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from chebsplat.splats.sh import colors_in_view, eval_sh, n_coefficients
+from chebsplat.splats.sh_kernels import colors_by_degree
 from chebsplat.training.sh_prune import dense, masked_sh
 
 
@@ -71,3 +72,16 @@ def test_a_band_that_is_not_used_gets_no_gradient():
     assert [band.grad is not None for band in bands] == [True, True, False, False]
     with pytest.raises(ValueError, match="degree 4"):
         colors_in_view(bands, None, index, means, eye, 4)
+
+
+def test_a_gaussian_shows_the_bands_of_its_own_degree_alone():
+    generator = torch.Generator().manual_seed(0)
+    n = 40
+    sh0, shN = (torch.randn(n, k, 3, generator=generator) for k in (1, 15))
+    degrees, means = torch.arange(n) % 4, torch.randn(n, 3, generator=generator)
+    index, eye = torch.randperm(n, generator=generator)[:25], torch.tensor([0.1, 0.2, 3.0])
+    colors = colors_by_degree(sh0, shN, degrees, index, means, eye)
+    for i, color in zip(index.tolist(), colors, strict=True):
+        degree = int(degrees[i])
+        one = slice(i, i + 1)
+        torch.testing.assert_close(color, eval_sh(sh0[one], shN[one], means[one] - eye, degree)[0])
