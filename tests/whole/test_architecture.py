@@ -31,7 +31,7 @@ PACKAGES = {
     "printed": set(),  # the paper in plain torch: nothing of ours
     "views": set(),
     "rasterize": {"kernels", "splats"},
-    "render": {"rasterize", "splats", "views"},
+    "render": {"kernels", "rasterize", "splats", "views"},
     "shape": {"cameras", "kernels", "settings", "splats"},
     "lifting": {"cameras", "kernels", "labels", "rasterize", "render", "splats", "views"},
     "evaluation": {"labels", "splats"},
