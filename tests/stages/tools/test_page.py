@@ -685,7 +685,7 @@ def test_in_a_browser_clicks_label_points_that_teaching_reads(scene, page, tmp_p
         for x, y in [*click, click[0]]:
             browser.click(x, y)
         browser.run("get('undo').click()")
-        browser.run("new Promise(done => setTimeout(done, 300))")
+        browser.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
         boxes = "Array.from(get('marks').children, mark => mark.getBoundingClientRect())"
         marks = browser.run(f"{boxes}.map(box => [box.x + 5, box.y + 5])")
         np.testing.assert_allclose(marks, click, atol=3)
