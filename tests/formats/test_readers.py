@@ -2,20 +2,31 @@
 agree.
 
 From PyPI gsply, Open3D, plyfile and zarr; from npm splat-transform (PlayCanvas), Spark and zarrita,
-installed into build/readers by the first test that wants them.
+installed into build/readers by the first test that wants them. Where there is a browser, Spark
+draws them there.
 """
 
+import base64
 import csv
+import json
 import shutil
 import subprocess
 
 import numpy as np
 import pytest
+from box_room import room
+from browser import BROWSER
+from driven import driven
+from served import served
 from shared import ROOT, gaussian_parameters
 
 from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.scene import Scene
 from chebsplat.formats.splats import read_splats, write_splats
+from chebsplat.render import SceneRenderer
+from chebsplat.stages.tools.page import foreign
+from chebsplat.stages.tools.scene import OpenedScene
+from chebsplat.synthetic.rays import open3d
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("readers")]
 
@@ -124,10 +135,8 @@ def test_ply_opens_in_gsply(exported):
 
 
 def test_ply_opens_in_open3d_tags_included(exported):
-    import open3d
-
     _, p, labels = exported
-    found = open3d.t.io.read_point_cloud(str(exported[0] / "scene.ply")).point
+    found = open3d().t.io.read_point_cloud(str(exported[0] / "scene.ply")).point
     assert np.array_equal(found.positions.numpy(), p["means"])
     assert np.array_equal(found.label.numpy().ravel(), labels)
     assert np.array_equal(found.sh_degree.numpy().ravel(), p["degrees"])
@@ -191,6 +200,41 @@ def test_small_files_of_ours_are_to_others_what_they_are_to_us(converted, packag
     if name == "scene.spz":
         assert np.abs(gsply.read_spz(converted / name).means - turned).max() < 1e-5
         assert np.abs(by_spark(converted / name, packages, tmp_path) - turned).max() <= 1.01 * GRID
+
+
+@pytest.mark.skipif(BROWSER is None, reason="neither chromium nor google-chrome is installed")
+def test_spark_draws_small_files_of_ours_as_it_draws_the_ply(packages, tmp_path):
+    parameters = room(20_000)[0]
+    parameters["degrees"] = np.ones(len(parameters["means"]), np.uint8)
+    shutil.copy(ROOT / "tests/support/spark.html", tmp_path)
+    (tmp_path / "node_modules").symlink_to(packages)
+    kinds = ("ply", "spz", "sog")
+    for kind in kinds:
+        write_splats(tmp_path / f"room.{kind}", dict(parameters))
+    seen = OpenedScene(foreign(tmp_path / "room.ply"), tmp_path / "room.ply").cameras[0]
+    view = seen.view()
+    camera = {"R": view.viewmat[:3, :3].ravel(), "t": view.viewmat[:3, 3], "K": view.K.ravel()}
+    camera = {name: values.tolist() for name, values in camera.items()}
+    camera |= {"width": view.width, "height": view.height}
+    drawn = {}
+    with served(tmp_path) as address, driven(tmp_path) as browser:
+        browser.open(f"{address}/spark.html", 960, 720)
+        loaded = "const wait = () => window.draw ? done() : setTimeout(wait, 50)"
+        browser.run(f"new Promise(done => {{ {loaded}; wait(); }})")
+        for kind in kinds:
+            given = json.dumps(camera | {"turned": kind == "spz"})
+            text = browser.run(f"draw('{address}/room.{kind}', {given})")
+            picture = np.frombuffer(base64.b64decode(text), np.uint8)
+            drawn[kind] = picture.reshape(view.height, view.width, 4)[::-1, :, :3].astype(float)
+    truth = SceneRenderer(parameters).render(view)[0]
+
+    def decibels(one, other):
+        return 10 * np.log10(255**2 / np.mean((one - other) ** 2))
+
+    # Spark widens small Gaussians more than the renderer does
+    assert decibels(drawn["ply"], truth) > 28
+    assert decibels(drawn["spz"], drawn["ply"]) > 38
+    assert decibels(drawn["sog"], drawn["ply"]) > 38
 
 
 def test_compressed_files_are_small(exported, converted):
