@@ -1,4 +1,4 @@
-"""`scene/4`: the exported scene: PLY and SPZ for viewers, ragged arrays, label names, a summary."""
+"""`scene/5`: the exported scene: PLY and SPZ for viewers, ragged arrays, label names, a summary."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from chebsplat.formats.world import World
 LABELS = "labels.json"
 MOST_MEANINGS = 65_536  # rows of the dictionary, which two bytes count
 REMEDY = "export the scene again"
-SEMANTIC = ("features", "meanings", "labels", "label_embeddings")
+SEMANTIC = ("features", "steps", "labels", "meanings", "label_embeddings")
 RAGGED = ("means", "log_scales", "quats", "sh0", "logit_opacities", "sh1", "sh2", "sh3")
 
 
@@ -40,7 +40,7 @@ class Scene:
       `formats.world.World` is another.
     """
 
-    SCHEMA: ClassVar[str] = "chebsplat.scene/4"
+    SCHEMA: ClassVar[str] = "chebsplat.scene/5"
     parameters: dict[str, np.ndarray]
     cameras: Cameras
     order: np.ndarray
@@ -53,11 +53,12 @@ class Scene:
         """Fill the directory that `artifact.publish` yields; returns bytes by part.
 
         Args:    rounded: the parameters of `scene.spz`, where light is rounded for it.
-        Raises:  ValueError on more than MOST_MEANINGS distinct features.
+        Raises:  ValueError on more than MOST_MEANINGS distinct meanings.
         Choices: `scene.ply` is trimmed to the highest degree in use, and `scene.spz` beside it
-          if SPZ can represent the scene; both are in the source's world. Features are rows of a
-          dictionary, in 16-bit fixed point: as small as halves, 20 times as exact. Degrees are
-          stored in the checkpoint's order, which they then tell.
+          if SPZ can represent the scene; both are in the source's world. Features and labels are
+          rows of a dictionary; features in 8 bits, of which each row has its own step, so that no
+          row is coarser for the length of another. Degrees are stored in the checkpoint's order,
+          which they then tell.
         """
         p, degrees, world = self.parameters, self.parameters["degrees"], World.read(self.summary)
         unsorted = np.empty_like(degrees)
@@ -74,26 +75,16 @@ class Scene:
         for band in range(1, top + 1):
             rows = p["shN"][degrees >= band, REST[band - 1] : REST[band]]
             bands[f"sh{band}"] = rows.reshape(len(rows), -1)
-        steps, meanings = {}, {}
-        if "features" in p:
-            step = float(np.abs(p["features"]).max(initial=0)) / 32767 or 1.0
-            fixed = np.round(p["features"] / step).astype(np.int16)
-            dictionary, rows = np.unique(fixed, axis=0, return_inverse=True)
-            if len(dictionary) > MOST_MEANINGS:
-                raise ValueError(f"{len(dictionary):,} features differ, {MOST_MEANINGS:,} may")
-            steps["features"] = step
-            meanings = {"features": dictionary, "meanings": rows.reshape(-1).astype(np.uint16)}
+        semantics = {} if self.labels is None and "features" not in p else self._dictionary()
         stored = RaggedScene(
             **{name: p[name] for name in ("means", "log_scales", "quats", "logit_opacities")},
             sh0=p["sh0"][:, 0],
             degrees=unsorted.astype(np.uint8),
             cameras=self.cameras,
-            steps=steps,
             summary=self.summary | {"max_degree": top, "n": len(degrees)},
-            labels=self.labels,
             label_embeddings=self.label_embeddings,
             **bands,
-            **meanings,
+            **semantics,
         )
         stored.write(out)
         write_document(out / LABELS, dict(enumerate(self.label_names or [])))
@@ -108,6 +99,29 @@ class Scene:
         stored.summary["bytes"] = sizes
         stored.write_attributes(out)
         return sizes
+
+    def _dictionary(self) -> dict[str, np.ndarray]:
+        """Rows that Gaussians share, `meanings`, and of each row its features and label."""
+        columns, n = [], len(self.order)
+        if self.labels is not None:
+            columns.append(self.labels[:, None].astype(np.int32))
+        features = self.parameters.get("features")
+        if features is not None:
+            columns.append(np.ascontiguousarray(features, np.float32).view(np.int32))
+        _, first, meanings = np.unique(
+            np.concatenate(columns, 1), axis=0, return_index=True, return_inverse=True
+        )
+        if len(first) > MOST_MEANINGS:
+            raise ValueError(f"{len(first):,} meanings differ, {MOST_MEANINGS:,} may")
+        stored = {"meanings": meanings.reshape(n).astype(np.uint16)}
+        if self.labels is not None:
+            stored["labels"] = self.labels[first].astype(np.int32)
+        if features is not None:
+            rows = features[first]
+            steps = (np.abs(rows).max(1) / 127).astype(np.float32)
+            stored["steps"] = np.where(steps > 0, steps, np.float32(1))
+            stored["features"] = np.round(rows / stored["steps"][:, None]).astype(np.int8)
+        return stored
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -127,21 +141,21 @@ class Scene:
             rows = getattr(stored, f"sh{band}").reshape(-1, width, 3)
             parameters["shN"][degrees >= band, REST[band - 1] : REST[band]] = rows
         parameters["degrees"] = degrees
-        if stored.features is not None and stored.meanings is not None:
-            if stored.meanings.max(initial=0) >= len(stored.features):
-                raise InputError(f"{path / 'meanings'} names a row that features lack; {REMEDY}")
-            dictionary = stored.features * np.float32(stored.steps["features"])
-            parameters["features"] = dictionary[stored.meanings]
-        names = (
-            read_label_names(path, artifact.read_manifest(path))
-            if stored.labels is not None
-            else None
-        )
+        labels = None
+        if (rows := stored.meanings) is not None:
+            held = [of for of in (stored.features, stored.steps, stored.labels) if of is not None]
+            if rows.max(initial=0) >= min(map(len, held), default=0):
+                raise InputError(f"{path / 'meanings'} names a row that is lacking; {REMEDY}")
+            if stored.features is not None and stored.steps is not None:
+                parameters["features"] = (stored.features * stored.steps[:, None])[rows]
+            if stored.labels is not None:
+                labels = stored.labels[rows]
+        names = read_label_names(path, artifact.read_manifest(path)) if labels is not None else None
         return cls(
             parameters,
             stored.cameras,
             order,
-            stored.labels,
+            labels,
             names,
             stored.label_embeddings,
             stored.summary,
@@ -153,7 +167,7 @@ class RaggedScene(Record):
     """`Scene` as stored: SH bands up to each Gaussian's degree, features as rows of a dictionary.
 
     All but `degrees` are in order of degree. sh1, sh2, sh3: rows of the Gaussians that keep the
-    band. features: the dictionary in fixed point, with `meanings` as its rows; steps: their unit.
+    band. features, in steps of their row, and labels: of the rows of a dictionary, `meanings`.
     """
 
     SCHEMA: ClassVar[str] = Scene.SCHEMA
@@ -166,16 +180,16 @@ class RaggedScene(Record):
         np.ndarray, Array("uint8", ("gaussian",), "highest SH band, in the checkpoint's order")
     ]
     cameras: Cameras
-    steps: dict[str, float]
     summary: dict[str, Any]
     sh1: Annotated[np.ndarray | None, Array("float32", ("gaussian_1", 9))] = None
     sh2: Annotated[np.ndarray | None, Array("float32", ("gaussian_2", 15))] = None
     sh3: Annotated[np.ndarray | None, Array("float32", ("gaussian_3", 21))] = None
-    features: Annotated[np.ndarray | None, Array("int16", ("meaning", "channel"), "a step")] = None
-    meanings: Annotated[np.ndarray | None, Array("uint16", ("gaussian",), "row of features")] = None
-    labels: Annotated[np.ndarray | None, Array("int32", ("gaussian",), "class index, -1 none")] = (
+    features: Annotated[np.ndarray | None, Array("int8", ("meaning", "channel"), "a step")] = None
+    steps: Annotated[np.ndarray | None, Array("float32", ("meaning",))] = None
+    labels: Annotated[np.ndarray | None, Array("int32", ("meaning",), "class index, -1 none")] = (
         None
     )
+    meanings: Annotated[np.ndarray | None, Array("uint16", ("gaussian",), "row of these")] = None
     label_embeddings: Annotated[np.ndarray | None, Array("float32", ("label", "channel"))] = None
 
 

@@ -155,7 +155,7 @@ STAGES: dict[str, Stage] = {
               megabytes=lambda k: 4 * k.gaussians / 40_000,  # 9, 22; 1083 MB
               help="Smooth the features of a finished scene and blend them with knowledge, as its "
                    "training views ask."),
-        Stage("export", "chebsplat.scene/4", (), (("gaussians", "train"),),
+        Stage("export", "chebsplat.scene/5", (), (("gaussians", "train"),),
               (("features", "teacher"), ("lifted", "lift"), ("refined", "refine")),
               seconds=lambda k: 0.1, megabytes=lambda k: 18 * k.gaussians / 40_000,
               mem_mb=2000,  # 1, 2; 138 MB

@@ -269,5 +269,6 @@ def test_ragged_arrays_open_in_zarr_and_zarrita(exported, name, packages, tmp_pa
     elif name == "means":
         assert np.array_equal(plain, p["means"])
     else:
-        rows = plain[np.asarray(group["meanings"][:])]
-        assert np.abs(rows * group.attrs["steps"][name] - p["features"]).max() < 1e-4
+        steps, rows = (np.asarray(group[of][:]) for of in ("steps", "meanings"))
+        found = (plain * steps[:, None])[rows]
+        assert np.abs(found - p["features"]).max() < 0.51 / 127 * np.abs(p["features"]).max()

@@ -99,7 +99,7 @@ def made(folder, calibrated=False):
     views = ["a.png", "b.png", "c.png"]
     cameras = Cameras(views, np.stack([K] * 3), poses, *SIZE)
     held = Scene(parameters, cameras, order, labels, LABELS, words()[:5])
-    with artifact.publish(folder / "export", Manifest("chebsplat.scene/4", KEY, "export")) as tmp:
+    with artifact.publish(folder / "export", Manifest("chebsplat.scene/5", KEY, "export")) as tmp:
         held.write(tmp)
     convention = {"kind": "onnx", "output": "features", "sha256": sha256_file(model)}
     features = Features(
