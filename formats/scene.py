@@ -55,10 +55,10 @@ class Scene:
         Args:    rounded: the parameters of `scene.spz`, where light is rounded for it.
         Raises:  ValueError on more than MOST_MEANINGS distinct meanings.
         Choices: `scene.ply` is trimmed to the highest degree in use, and `scene.spz` beside it
-          if SPZ can represent the scene; both are in the source's world. Features and labels are
-          rows of a dictionary; features in 8 bits, of which each row has its own step, so that no
-          row is coarser for the length of another. Degrees are stored in the checkpoint's order,
-          which they then tell.
+          if SPZ can represent the scene; both are in the source's world. Features take 8 bits a
+          channel, in steps of each row's own, so that a long row does not coarsen others; labels
+          are of the features before. Degrees are stored in the checkpoint's order, which they then
+          tell.
         """
         p, degrees, world = self.parameters, self.parameters["degrees"], World.read(self.summary)
         unsorted = np.empty_like(degrees)
@@ -75,7 +75,6 @@ class Scene:
         for band in range(1, top + 1):
             rows = p["shN"][degrees >= band, REST[band - 1] : REST[band]]
             bands[f"sh{band}"] = rows.reshape(len(rows), -1)
-        semantics = {} if self.labels is None and "features" not in p else self._dictionary()
         stored = RaggedScene(
             **{name: p[name] for name in ("means", "log_scales", "quats", "logit_opacities")},
             sh0=p["sh0"][:, 0],
@@ -84,7 +83,7 @@ class Scene:
             summary=self.summary | {"max_degree": top, "n": len(degrees)},
             label_embeddings=self.label_embeddings,
             **bands,
-            **semantics,
+            **self._dictionary(),
         )
         stored.write(out)
         write_document(out / LABELS, dict(enumerate(self.label_names or [])))
@@ -101,26 +100,33 @@ class Scene:
         return sizes
 
     def _dictionary(self) -> dict[str, np.ndarray]:
-        """Rows that Gaussians share, `meanings`, and of each row its features and label."""
-        columns, n = [], len(self.order)
+        """Rows that Gaussians share, `meanings`, and of each row its features and label; empty
+        without semantics.
+        """
+        columns = []
         if self.labels is not None:
-            columns.append(self.labels[:, None].astype(np.int32))
+            columns.append(self.labels[:, None])
         features = self.parameters.get("features")
         if features is not None:
             columns.append(np.ascontiguousarray(features, np.float32).view(np.int32))
+        if not columns:
+            return {}
         _, first, meanings = np.unique(
             np.concatenate(columns, 1), axis=0, return_index=True, return_inverse=True
         )
         if len(first) > MOST_MEANINGS:
             raise ValueError(f"{len(first):,} meanings differ, {MOST_MEANINGS:,} may")
-        stored = {"meanings": meanings.reshape(n).astype(np.uint16)}
+        stored = {"meanings": meanings.reshape(-1).astype(np.uint16)}
         if self.labels is not None:
-            stored["labels"] = self.labels[first].astype(np.int32)
+            stored["labels"] = self.labels[first]
         if features is not None:
             rows = features[first]
+            if not np.isfinite(rows).all():
+                raise ValueError("features are not finite")
             steps = (np.abs(rows).max(1) / 127).astype(np.float32)
             stored["steps"] = np.where(steps > 0, steps, np.float32(1))
-            stored["features"] = np.round(rows / stored["steps"][:, None]).astype(np.int8)
+            stored["features"] = np.round(rows / stored["steps"][:, None]).clip(-127, 127)
+            stored["features"] = stored["features"].astype(np.int8)
         return stored
 
     @classmethod
@@ -143,8 +149,8 @@ class Scene:
         parameters["degrees"] = degrees
         labels = None
         if (rows := stored.meanings) is not None:
-            held = [of for of in (stored.features, stored.steps, stored.labels) if of is not None]
-            if rows.max(initial=0) >= min(map(len, held), default=0):
+            held = stored.labels if stored.features is None else stored.features
+            if held is None or rows.max(initial=0) >= len(held):
                 raise InputError(f"{path / 'meanings'} names a row that is lacking; {REMEDY}")
             if stored.features is not None and stored.steps is not None:
                 parameters["features"] = (stored.features * stored.steps[:, None])[rows]
@@ -164,10 +170,11 @@ class Scene:
 
 @dataclass
 class RaggedScene(Record):
-    """`Scene` as stored: SH bands up to each Gaussian's degree, features as rows of a dictionary.
+    """`Scene` as stored: SH bands up to each Gaussian's degree, meanings as rows of a dictionary.
 
-    All but `degrees` are in order of degree. sh1, sh2, sh3: rows of the Gaussians that keep the
-    band. features, in steps of their row, and labels: of the rows of a dictionary, `meanings`.
+    Arrays of Gaussians are in order of degree, but for `degrees`. sh1, sh2, sh3: rows of the
+    Gaussians that keep the band. meanings: each Gaussian's row of `features`, in `steps` of that
+    row, and of `labels`.
     """
 
     SCHEMA: ClassVar[str] = Scene.SCHEMA
@@ -184,12 +191,18 @@ class RaggedScene(Record):
     sh1: Annotated[np.ndarray | None, Array("float32", ("gaussian_1", 9))] = None
     sh2: Annotated[np.ndarray | None, Array("float32", ("gaussian_2", 15))] = None
     sh3: Annotated[np.ndarray | None, Array("float32", ("gaussian_3", 21))] = None
-    features: Annotated[np.ndarray | None, Array("int8", ("meaning", "channel"), "a step")] = None
-    steps: Annotated[np.ndarray | None, Array("float32", ("meaning",))] = None
+    features: Annotated[
+        np.ndarray | None, Array("int8", ("meaning", "channel"), "steps of its row")
+    ] = None
+    steps: Annotated[np.ndarray | None, Array("float32", ("meaning",), "of a row of features")] = (
+        None
+    )
     labels: Annotated[np.ndarray | None, Array("int32", ("meaning",), "class index, -1 none")] = (
         None
     )
-    meanings: Annotated[np.ndarray | None, Array("uint16", ("gaussian",), "row of these")] = None
+    meanings: Annotated[
+        np.ndarray | None, Array("uint16", ("gaussian",), "row of features, steps, labels")
+    ] = None
     label_embeddings: Annotated[np.ndarray | None, Array("float32", ("label", "channel"))] = None
 
 

@@ -195,7 +195,8 @@ def lines(rows: Sequence[dict[str, Any]], name: str) -> list[str]:
         text = f"  {measure:24s} {np.mean(means):5.1f}"
         if name != BASELINE and (BASELINE, measure, 0) in by:
             apart = paired_difference(means, beside, [str(room) for room in tested])
-            text += f" ({apart.mean:+.1f}; {apart.low:+.1f} to {apart.high:+.1f})"
+            among = f"; {apart.low:+.1f} to {apart.high:+.1f}" if len(tested) > 1 else ""
+            text += f" ({apart.mean:+.1f}{among})"
         found_lines.append(text)
     return found_lines
 

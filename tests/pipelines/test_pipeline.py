@@ -98,7 +98,7 @@ def descriptor_code(tree):
 
 
 def format_code(tree):
-    edit(tree / "formats/scene.py", "32767", "32766")
+    edit(tree / "formats/scene.py", "/ 127)", "/ 126)")
 
 
 CODE_CHANGES = [

@@ -54,7 +54,9 @@ def test_only_training_views_are_lifted_and_the_export_has_what_was(lifted, tmp_
     scene, unseen = Scene.read(tmp_path / "export"), ~held.features.any(1)
     assert unseen.any() and not unseen.all()
     np.testing.assert_array_equal(scene.labels[np.argsort(scene.order)] == -1, unseen)
-    np.testing.assert_allclose(scene.parameters["features"], held.features[scene.order], atol=1e-4)
+    wanted = held.features[scene.order]
+    step = np.abs(wanted).max(1, keepdims=True) / 127
+    assert (np.abs(scene.parameters["features"] - wanted) <= 0.51 * step).all()
 
 
 def test_a_ply_gets_what_its_checkpoint_gets_and_becomes_a_folder_of_artifacts(lifted, tmp_path):

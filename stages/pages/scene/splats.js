@@ -45,9 +45,9 @@ function decoded(arrays, ranges, center) {
   return { n, means, covariances, reach, opacities, colors, sh1 };
 }
 
-/** The Gaussians that a camera { turn, shift, slopes } may see, back to front, by 24 bits of depth in two passes of 12, as
- * floats compare as integers: a wall seen face on is that thin. slopes: the picture's half sides at depth 1; a margin allows
- * for a camera that turns on. */
+/** The Gaussians that a camera { turn, shift, slopes } may see, back to front: sorted by 24 bits of depth, in two passes of
+ * 12, since Gaussians of a wall seen face on differ only in low bits. Floats compare as integers. slopes: the picture's half
+ * sides at depth 1; a margin allows for a camera that turns on. */
 function sorted(means, reach, { turn: R, shift, slopes: [wide, tall] }) {
   const n = reach.length, depths = new Float32Array(n), bits = new Uint32Array(depths.buffer);
   let low = 0xffffffff, high = 0, count = 0, order = new Uint32Array(n);
