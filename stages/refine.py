@@ -21,6 +21,7 @@ from chebsplat.lifting.blend import (
     calibrate,
     confidence,
     effective,
+    errors_alike,
     familiar,
     reliable,
     start,
@@ -72,7 +73,8 @@ def run(job: Job) -> None:
     unit, job.facts["unit_from"] = scene_unit(capture, p["means"])
     near = affinities(p["means"], *surface_of(p), unit)
     knowledge = predict_from_shape(job, p, unit)
-    choice = calibrate(lifted.halves, lifted.half_views, near, knowledge)
+    alike = errors_alike(lifted.agreement, lifted.halves, lifted.half_views)
+    choice = calibrate(lifted.halves, lifted.half_views, near, knowledge, alike)
     smoothed = choice.smooth if settings.smooth == "auto" else settings.smooth == "on"
     strength = choice.strength
     known_to_teacher = belief = 1.0
@@ -84,7 +86,7 @@ def run(job: Job) -> None:
         belief = believed(lifted.features, lifted.n_views, knowledge, embeddings, known_to_teacher)
         strength *= belief
         evidence = (
-            effective(lifted.n_views)
+            effective(lifted.n_views, alike)
             * reliable(lifted.halves, lifted.half_views)
             * known_to_teacher
         )
@@ -96,9 +98,9 @@ def run(job: Job) -> None:
         name: {f"{k:g}": value for k, value in row.items()} for name, row in choice.curve.items()
     }
     notes = {"start": started, "smooth": smoothed, "strength": strength, "curve": curve}
-    notes |= {"familiar": known_to_teacher, "believed": belief}
+    notes |= {"familiar": known_to_teacher, "believed": belief, "alike": alike}
     sure = confidence(
-        steps[1], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher
+        steps[1], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher, alike
     )
     Refined(steps[2], sure, notes).write(job.out)
     of_strength = choice.curve["on" if smoothed else "off"]

@@ -11,7 +11,7 @@ from chebsplat.labels.decode import decode, decode_labels
 from chebsplat.lifting.smoothing import Affinities, smooth
 
 STRENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # views that knowledge may count for
-ALIKE = 0.2  # correlation of the errors of two views of a thing
+ALIKE = 0.2  # correlation of the errors of two views of a thing, at most
 SURE = 3  # power of its length by which knowledge counts
 # power by which views count of how far their halves agree, and of how sure they are beside shape
 AGREED = 6
@@ -58,14 +58,36 @@ def trusted(knowledge: np.ndarray, strength: float) -> np.ndarray:
     return np.asarray(strength * lengths(knowledge).clip(0, 1) ** SURE, np.float32)
 
 
-def effective(n_views: np.ndarray) -> np.ndarray:
-    """n' = n / (1 + ALIKE (n - 1)): independent views that n views are worth, f32 [N].
+def effective(n_views: np.ndarray, alike: float = ALIKE) -> np.ndarray:
+    """n' = n / (1 + a (n - 1)): independent views that n views are worth, f32 [N].
 
-    Choices: a teacher errs alike in neighbouring views, so that a hundred of them never count for
-      more than five.
+    Args: alike: a, correlation of the errors of two views, see `errors_alike`.
+    Choices: where a teacher errs alike in neighbouring views a hundred never count for more than
+      five.
     """
     n = n_views.astype(np.float32)
-    return np.asarray(n / (1 + ALIKE * np.maximum(n - 1, 0)), np.float32)
+    return np.asarray(n / (1 + alike * np.maximum(n - 1, 0)), np.float32)
+
+
+def errors_alike(agreement: np.ndarray, halves: np.ndarray, half_views: np.ndarray) -> float:
+    """Correlation a of the errors of two views that are near each other, in [0, ALIKE].
+
+    Args: agreement r [N] of all views; halves [2, N, C] and half_views [2, N] as for `reliable`.
+    Returns: by how much more the halves differ than 1 - r^2 of single views explains if errors were
+      independent; ALIKE where no Gaussian is seen by two views of each half.
+    Choices: halves are of blocks of neighbouring views, so that what neighbours have in common
+      differs between them. What all views have in common does not show: a teacher whose views err
+      in the same way everywhere differs in blocks, too, and has more than ALIKE (0.3 to 0.5); one
+      of independent errors has none.
+    """
+    both = (half_views >= 2).all(0)
+    n, r = half_views[:, both].astype(np.float64), agreement[both].astype(np.float64)
+    spread = (1 - r**2) * n.sum(0) / (n.sum(0) - 1)
+    if not spread.sum() > 0:
+        return ALIKE
+    apart = 2 * (1 - cosines(*halves[:, both])) * r**2
+    independent, common = spread * (1 / n).sum(0), spread * (1 - 1 / n).sum(0)
+    return float(np.clip((apart.sum() - independent.sum()) / common.sum(), 0, ALIKE))
 
 
 def reliable(halves: np.ndarray, half_views: np.ndarray) -> np.ndarray:
@@ -144,15 +166,17 @@ def calibrate(
     half_views: np.ndarray,
     near: Affinities,
     knowledge: np.ndarray | None = None,
+    alike: float = ALIKE,
 ) -> Calibration:
     """Choice of smoothing and of knowledge's strength: those by which half the views predict the
     rest.
 
     Args: halves [2, N, C], features by each half of the training views; half_views [2, N] how many
       of them see each; near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing
-      is decided.
+      is decided; alike: as for `effective`.
     Returns: whether smoothing alone makes the halves agree better, and the strength at which they
-      agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up. Agreement is the
+      agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up, less where
+      errors are less alike than ALIKE: the halves then know what the views do. Agreement is the
       cosine between what is made of one half (smoothed, blended by its own views) and the other
       half's mean features, averaged over the Gaussians that both see, by the other half's views,
       both ways alike.
@@ -174,7 +198,7 @@ def calibrate(
         for k in strengths:
             agreed = 0.0
             for own, other in ((0, 1), (1, 0)):
-                evidence = effective(half_views[own]) * reliability
+                evidence = effective(half_views[own], alike) * reliability
                 blended = (
                     variants[own]
                     if knowledge is None
@@ -182,8 +206,10 @@ def calibrate(
                 )
                 agreed += float(weights[other] @ cosines(blended, halves[other]))
             curve[name][k] = agreed / max(float(weights.sum()), 1.0)
-    evidence, visible = effective(half_views.sum(0)) * reliability, half_views.any(0)
-    least = max(LEAST, LEAST_SHARE * float(evidence[visible].mean())) if weights.any() else math.inf
+    evidence, visible = effective(half_views.sum(0), alike) * reliability, half_views.any(0)
+    least = math.inf
+    if weights.any():
+        least = max(LEAST, LEAST_SHARE * float(evidence[visible].mean())) * alike / ALIKE
     tried = [k for k in strengths if k >= least]
     strength = max(tried, key=lambda k: (curve["off"][k], -k), default=0.0)
     return Calibration(curve["on"][0.0] > curve["off"][0.0], strength, curve)
@@ -211,14 +237,15 @@ def confidence(
     knowledge: np.ndarray | None = None,
     strength: float = 0.0,
     worth: float = 1.0,
+    alike: float = ALIKE,
 ) -> np.ndarray:
     """Length of the mean of all votes and a zero one: |n' r f/|f| + k' g/|g|| / (n' + k' + 1), f32
     [N].
 
     Args: agreement r [N] in [0, 1] of the views; worth: of `familiar`, which n' is multiplied by;
-      the others as for `blend`.
+      alike: as for `effective`; the others as for `blend`.
     """
-    n = effective(n_views) * worth
+    n = effective(n_views, alike) * worth
     votes, total = (n * agreement)[:, None] * unit(features), n + 1
     if knowledge is not None:
         k = trusted(knowledge, strength)

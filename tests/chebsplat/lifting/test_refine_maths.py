@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from chebsplat.lifting.blend import (
+    ALIKE,
     LEAST,
     STRENGTHS,
     believed,
@@ -15,6 +16,7 @@ from chebsplat.lifting.blend import (
     calibrate,
     confidence,
     effective,
+    errors_alike,
     familiar,
     halves_agree,
     reliable,
@@ -144,6 +146,37 @@ def test_affinities_refuse_a_unit_that_is_none(scene):
 def test_views_that_err_alike_count_for_fewer():
     n = np.array([0, 1, 2, 6, 10_000])
     np.testing.assert_allclose(effective(n), [0, 1, 2 / 1.2, 3, 5], rtol=1e-3)
+
+
+def views_of(n, n_blocks, shared, own, seed=0):
+    """Agreement, halves and their views of 300 Gaussians seen by n views, in blocks of neighbours
+    by turns; errors that a block shares and each view's own have these lengths.
+    """
+    rng = np.random.default_rng(seed)
+    errors = own * rng.normal(size=(n, 300, 8)) / 8**0.5
+    block = np.arange(n) // (n // n_blocks)
+    errors += shared * rng.normal(size=(n_blocks, 300, 8))[block] / 8**0.5
+    seen = unit((np.eye(8)[0] + errors).reshape(-1, 8)).reshape(n, 300, 8)
+    halves = np.stack([seen[block % 2 == half].mean(0) for half in (0, 1)])
+    n_views = np.stack([np.full(300, int((block % 2 == half).sum())) for half in (0, 1)])
+    return np.linalg.norm(seen.mean(0), axis=1), halves, n_views
+
+
+def test_errors_of_views_are_told_to_be_their_own_or_their_neighbours_too():
+    assert errors_alike(*views_of(16, 4, 0.0, 0.7)) < 0.02
+    assert 0.05 < errors_alike(*views_of(16, 4, 0.25, 0.6)) < 0.15
+    assert errors_alike(*views_of(16, 4, 0.6, 0.3)) == ALIKE
+    agreement, halves, n_views = views_of(16, 4, 0.0, 0.7)
+    assert errors_alike(agreement, halves, np.minimum(n_views, 1)) == ALIKE  # nothing to tell by
+    assert errors_alike(np.ones(300), halves[[0, 0]], n_views) == ALIKE  # no errors
+    np.testing.assert_allclose(effective(np.array([1, 6, 100]), 0.0), [1, 6, 100])
+
+
+def test_where_errors_are_not_alike_calibration_may_leave_knowledge_out():
+    halves, n_views, truth, near = votes(2, 0.02)
+    wrong = truth[:, ::-1].copy()
+    assert calibrate(halves, n_views, near, wrong).strength >= LEAST
+    assert calibrate(halves, n_views, near, wrong, 0.0).strength == 0
 
 
 def test_what_is_refined_lies_midway_between_trained_and_lifted_and_is_as_long_as_the_trained():
