@@ -175,8 +175,8 @@ def calibrate(
       of them see each; near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing
       is decided; alike: as for `effective`.
     Returns: whether smoothing alone makes the halves agree better, and the strength at which they
-      agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up, less where
-      errors are less alike than ALIKE: the halves then know what the views do. Agreement is the
+      agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up; of a lower
+      share where errors are less alike than ALIKE, for the halves then show them. Agreement is the
       cosine between what is made of one half (smoothed, blended by its own views) and the other
       half's mean features, averaged over the Gaussians that both see, by the other half's views,
       both ways alike.
@@ -209,7 +209,7 @@ def calibrate(
     evidence, visible = effective(half_views.sum(0), alike) * reliability, half_views.any(0)
     least = math.inf
     if weights.any():
-        least = max(LEAST, LEAST_SHARE * float(evidence[visible].mean())) * alike / ALIKE
+        least = max(LEAST, LEAST_SHARE * float(evidence[visible].mean()) * alike / ALIKE)
     tried = [k for k in strengths if k >= least]
     strength = max(tried, key=lambda k: (curve["off"][k], -k), default=0.0)
     return Calibration(curve["on"][0.0] > curve["off"][0.0], strength, curve)
