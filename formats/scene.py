@@ -149,8 +149,8 @@ class Scene:
         parameters["degrees"] = degrees
         labels = None
         if (rows := stored.meanings) is not None:
-            held = stored.labels if stored.features is None else stored.features
-            if held is None or rows.max(initial=0) >= len(held):
+            dictionary = stored.labels if stored.features is None else stored.features
+            if dictionary is None or rows.max(initial=0) >= len(dictionary):
                 raise InputError(f"{path / 'meanings'} names a row that is lacking; {REMEDY}")
             if stored.features is not None and stored.steps is not None:
                 parameters["features"] = (stored.features * stored.steps[:, None])[rows]

@@ -62,8 +62,7 @@ def effective(n_views: np.ndarray, alike: float = ALIKE) -> np.ndarray:
     """n' = n / (1 + a (n - 1)): independent views that n views are worth, f32 [N].
 
     Args: alike: a, correlation of the errors of two views, see `errors_alike`.
-    Choices: where a teacher errs alike in neighbouring views a hundred never count for more than
-      five.
+    Choices: at ALIKE a hundred views count for no more than five.
     """
     n = n_views.astype(np.float32)
     return np.asarray(n / (1 + alike * np.maximum(n - 1, 0)), np.float32)
@@ -75,10 +74,9 @@ def errors_alike(agreement: np.ndarray, halves: np.ndarray, half_views: np.ndarr
     Args: agreement r [N] of all views; halves [2, N, C] and half_views [2, N] as for `reliable`.
     Returns: by how much more the halves differ than 1 - r^2 of single views explains if errors were
       independent; ALIKE where no Gaussian is seen by two views of each half.
-    Choices: halves are of blocks of neighbouring views, so that what neighbours have in common
-      differs between them. What all views have in common does not show: a teacher whose views err
-      in the same way everywhere differs in blocks, too, and has more than ALIKE (0.3 to 0.5); one
-      of independent errors has none.
+    Choices: halves are of blocks of neighbouring views, so that an error that neighbours share
+      sets them apart. One that all views share does not show; hence ALIKE for teachers with more
+      (0.3 to 0.5 of the embedded one). Noisy labels have 0.
     """
     both = (half_views >= 2).all(0)
     n, r = half_views[:, both].astype(np.float64), agreement[both].astype(np.float64)
@@ -175,8 +173,8 @@ def calibrate(
       of them see each; near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing
       is decided; alike: as for `effective`.
     Returns: whether smoothing alone makes the halves agree better, and the strength at which they
-      agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up; of a lower
-      share where errors are less alike than ALIKE, for the halves then show them. Agreement is the
+      agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up; that share falls
+      to 0 with `alike`, since halves show errors that are not alike. Agreement is the
       cosine between what is made of one half (smoothed, blended by its own views) and the other
       half's mean features, averaged over the Gaussians that both see, by the other half's views,
       both ways alike.
