@@ -1,4 +1,4 @@
-"""`knowledge/2`: an encoder of shape, and the map from its features to meaning."""
+"""`knowledge/3`: an encoder of shape, and the map from its features to meaning."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from chebsplat.formats.lesson import SPECS as SUMS
 from chebsplat.formats.lesson import PlainSums, packed, unpacked
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
-SCHEMA = "chebsplat.knowledge/2"
+SCHEMA = "chebsplat.knowledge/3"
 # of the embedded teacher; ships with the package
 SHIPPED = Path(__file__).parents[1] / "teachers/knowledge"
 SPECS: dict[str, Spec] = {"matrix": ("float32", "C", "d"), "embeddings": ("float16", "W", "d"),
                           "map": ("float32", "p", "2 d"), "basis": ("float32", "p", "r"),
-                          "scale": ("float32", "p")}  # fmt: skip
+                          "scale": ("float32", "p"),
+                          "class_means": ("float32", "K", "p")}  # fmt: skip
 
 
 @dataclass
@@ -33,6 +34,8 @@ class Knowledge:
     words:      W words of the vocabulary; embeddings f16 [W, d], unit in the teacher's channels.
     map:        f32 [p, 2 d], from features of shape to d of the teacher's channels and d of words.
     basis:      f32 [p, r], of features times scale f32 [p]: the subspace learned so far (Eq 15).
+    classes:    K classes that it was taught; class_means f32 [K, p], the mean features of shape of
+      each, by which the classes are found that shape does not tell apart.
     card:       training facts; for each kind of room held out, the shares of points named right
       (`stages.teach.measured`) and, in `novelty`, the largest ρ′.
     lessons:    the lessons it was solved from, in `of`: of each its key, scene, trust, the reason,
@@ -51,12 +54,14 @@ class Knowledge:
     map: np.ndarray
     basis: np.ndarray
     scale: np.ndarray
+    classes: list[str]
+    class_means: np.ndarray
     card: dict[str, Any]
     lessons: dict[str, Any] = field(default_factory=dict)
     shipped: list[PlainSums] = field(default_factory=list)
 
 
-DOCUMENT = ("teacher", "digest", "encoder", "describe", "words", "card", "lessons")
+DOCUMENT = ("teacher", "digest", "encoder", "describe", "words", "classes", "card", "lessons")
 
 
 def write_knowledge(out: Path, knowledge: Knowledge) -> None:

@@ -16,6 +16,7 @@ from chebsplat.formats.knowledge import read_knowledge
 from chebsplat.formats.lifted import Lifted, Refined
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.blend import (
+    Shape,
     believed,
     blend,
     calibrate,
@@ -23,6 +24,7 @@ from chebsplat.lifting.blend import (
     effective,
     errors_alike,
     familiar,
+    halves_agree,
     reliable,
     start,
     trusted,
@@ -31,7 +33,7 @@ from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import affinities, smooth
 from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages.runtime.command import Job
-from chebsplat.stages.shape_models.answers import into_channels, unnamed
+from chebsplat.stages.shape_models.answers import confused_with, into_channels, unnamed
 from chebsplat.stages.shape_models.surfaces import in_scene, scene_unit
 from chebsplat.stages.training.truth import labels_right
 
@@ -72,52 +74,55 @@ def run(job: Job) -> None:
     features = start(started, lifted.features, trained)
     unit, job.facts["unit_from"] = scene_unit(capture, p["means"])
     near = affinities(p["means"], *surface_of(p), unit)
-    knowledge = predict_from_shape(job, p, unit)
+    shape = predict_from_shape(job, p, unit)
     alike = errors_alike(lifted.agreement, lifted.halves, lifted.half_views)
-    choice = calibrate(lifted.halves, lifted.half_views, near, knowledge, alike)
+    choice = calibrate(lifted.halves, lifted.half_views, near, shape, alike)
     smoothed = choice.smooth if settings.smooth == "auto" else settings.smooth == "on"
     strength = choice.strength
     known_to_teacher = belief = 1.0
-    steps = [features, smooth(features, lifted.n_views, near) if smoothed else features]
-    steps.append(steps[1])
-    if knowledge is not None:
-        embeddings = Features.read(job.inputs["features"]).label_embeddings
-        known_to_teacher = familiar(lifted.features, knowledge, embeddings)
-        belief = believed(lifted.features, lifted.n_views, knowledge, embeddings, known_to_teacher)
+    own = [features, *lifted.halves]
+    views = [lifted.n_views, *lifted.half_views]
+    alone = [smooth(*of, near) for of in zip(own, views, strict=True)] if smoothed else own
+    refined, knowledge = alone, None
+    if shape is not None:
+        known_to_teacher = familiar(lifted.features, shape.answers, shape.embeddings)
+        belief = believed(
+            lifted.features, lifted.n_views, shape.answers, shape.embeddings, known_to_teacher
+        )
         strength *= belief
-        evidence = (
-            effective(lifted.n_views, alike)
-            * reliable(lifted.halves, lifted.half_views)
-            * known_to_teacher
-        )
-        blended = blend(steps[1], evidence, knowledge, strength)
-        steps[2] = (
-            smooth(blended, evidence + trusted(knowledge, strength), near) if smoothed else blended
-        )
+    if shape is not None and strength > 0:
+        weight = reliable(lifted.halves, lifted.half_views) * known_to_teacher
+        refined = []
+        for of, n in zip(own, views, strict=True):
+            answers, evidence = shape.beside(of), effective(n, alike) * weight
+            blended = blend(of, evidence, answers, strength)
+            votes = evidence + trusted(answers, strength)
+            refined.append(smooth(blended, votes, near) if smoothed else blended)
+        knowledge = shape.beside(features)
     curve = {
         name: {f"{k:g}": value for k, value in row.items()} for name, row in choice.curve.items()
     }
     notes = {"start": started, "smooth": smoothed, "strength": strength, "curve": curve}
     notes |= {"familiar": known_to_teacher, "believed": belief, "alike": alike}
     sure = confidence(
-        steps[1], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher, alike
+        alone[0], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher, alike
     )
-    Refined(steps[2], sure, notes).write(job.out)
-    of_strength = choice.curve["on" if smoothed else "off"]
-    agree = float(np.interp(strength, list(of_strength), list(of_strength.values())))
-    job.facts |= {"halves_agree": agree, "gain": agree - choice.curve["off"][0.0]}
+    Refined(refined[0], sure, notes).write(job.out)
+    before, after = (
+        halves_agree(lifted.halves, lifted.half_views, of) for of in (None, refined[1:])
+    )
+    job.facts |= {"halves_agree": after, "gain": after - before}
     if capture is not None and "features" in job.inputs:
         job.facts["right"] = labels_right(
-            capture, p, steps[2], Features.read(job.inputs["features"])
+            capture, p, refined[0], Features.read(job.inputs["features"])
         )
-    job.facts |= {"n_gaussians": len(features), "unit": unit, **notes} | shares(job, steps)
+    job.facts |= {"n_gaussians": len(features), "unit": unit, **notes}
+    job.facts |= shares(job, [features, alone[0], refined[0]])
 
 
-def predict_from_shape(
-    job: Job, parameters: dict[str, np.ndarray], unit: float
-) -> np.ndarray | None:
-    """Features of the Gaussians f32 [N, C] that knowledge predicts from the shape at the described
-    points beside them; None where the scene has no knowledge, or none of it applies.
+def predict_from_shape(job: Job, parameters: dict[str, np.ndarray], unit: float) -> Shape | None:
+    """Features of the Gaussians that knowledge predicts from the shape at the described points
+    beside them; None where the scene has no knowledge, or none of it applies.
 
     Args: parameters: of the Gaussians; unit: scene units in a metre.
     Raises: ConfigError where an input that knowledge needs is missing.
@@ -155,12 +160,18 @@ def predict_from_shape(
     )
     if descriptors.notes["of"] == "swept depth":
         carried *= 1 / (1 + (away[:, None] / unit / REACH) ** 2)
+    names, taken = features.label_names, confused_with(path, knowledge, features)
+    confused = {names[k]: names[to] for k, to in enumerate(taken) if to != k}
+    if confused:
+        pairs = ", ".join(f"{name} for {other}" for name, other in confused.items())
+        job.left_out("votes of shape against some labels", f"knowledge takes {pairs}")
     job.facts["knowledge"] = {
         "of": descriptors.notes["of"],
         "n_points": len(means),
         "lessons": knowledge.lessons,
+        "confused": confused,
     }
-    return carried
+    return Shape(carried, features.label_embeddings, taken)
 
 
 def shares(job: Job, steps: list[np.ndarray]) -> dict[str, Any]:

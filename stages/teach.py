@@ -28,6 +28,7 @@ from chebsplat.shape.lessons import (
     LEAST_VIEWS,
     Sums,
     basis,
+    class_means,
     combined,
     mapped,
     mean_of,
@@ -96,6 +97,8 @@ def run(job: Job) -> None:
     whole = mean_of(of_rooms)
     scale = scale_of(whole)
     shape_basis = basis(whole, scale)
+    separable = -1 not in named and len(classes) <= len(classes[0])
+    means, with_points = class_means(whole, units(classes) if separable else classes[:0])
     card = settings.model_dump(mode="json", exclude={"model", "seed"})
     newest: dict[str, float] = {}
     for name, of in zip(KINDS, zip(*tested, strict=True), strict=True):
@@ -129,6 +132,8 @@ def run(job: Job) -> None:
             shape_map,
             shape_basis.astype(np.float32),
             scale.astype(np.float32),
+            [CLASS_NAMES[k] for k in with_points],
+            means.astype(np.float32),
             card,
             shipped=list(of_rooms),
         ),

@@ -22,7 +22,7 @@ from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import SHIPPED, read_knowledge
 from chebsplat.labels.decode import decode_labels
-from chebsplat.lifting.blend import blend, calibrate, effective, familiar, reliable, trusted
+from chebsplat.lifting.blend import Shape, blend, calibrate, effective, familiar, reliable, trusted
 from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import affinities, smooth
 from chebsplat.render import SceneRenderer
@@ -30,7 +30,7 @@ from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages.evaluate import camera
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import LiftSection
-from chebsplat.stages.shape_models.answers import answered, inputs_of, into_channels
+from chebsplat.stages.shape_models.answers import answered, confused_with, inputs_of, into_channels
 from chebsplat.stages.shape_models.surfaces import in_scene
 from chebsplat.stages.training.lifting import lifted_from
 
@@ -118,19 +118,21 @@ def main(arguments: Sequence[str]) -> None:
     )
     inputs, (means, normals) = inputs_of(SHIPPED, described, shipped), in_scene(described)
 
-    def carry_knowledge() -> np.ndarray:
-        return carry(
+    def carry_knowledge() -> Shape:
+        answers, _ = carry(
             translated(answered(shipped, inputs)), means, normals, scene.means, scene.surface[0]
-        )[0]
+        )
+        confused = confused_with(SHIPPED, shipped, scene.taught)
+        return Shape(answers, scene.taught.label_embeddings, confused)
 
-    knowledge, to_know = timed(carry_knowledge)
+    shape, to_know = timed(carry_knowledge)
 
     def blended() -> np.ndarray:
-        choice = calibrate(lifted.halves, lifted.half_views, near, knowledge)
+        choice = calibrate(lifted.halves, lifted.half_views, near, shape)
         evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views)
-        evidence = evidence * familiar(lifted.features, knowledge, scene.taught.label_embeddings)
-        start = smoothed if choice.smooth else scene.features
-        result = blend(start, evidence, knowledge, choice.strength)
+        evidence = evidence * familiar(lifted.features, shape.answers, shape.embeddings)
+        knowledge = shape.beside(scene.features)
+        result = blend(scene.features, evidence, knowledge, choice.strength)
         votes = evidence + trusted(knowledge, choice.strength)
         return smooth(result, votes, near) if choice.smooth else result
 

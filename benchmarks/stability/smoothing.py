@@ -13,6 +13,7 @@ from chebsplat.lifting.smoothing import (
     ANGLE,
     COLOR,
     DISTANCE,
+    PASSES,
     PLANE,
     REACH,
     affinities,
@@ -92,8 +93,10 @@ def smoothed(of: Cloud, dtype: type) -> np.ndarray:
     weights = np.where(square <= REACH**2, np.exp(-exponent / 2), 0)
     weights[np.arange(len(x)), np.arange(len(x))] = 1
     total = weights @ evidence
-    mean = (weights @ (evidence[:, None] * features)) / total[:, None]
-    return np.where(total[:, None] > 0, mean, features) if dtype is np.longdouble else mean
+    for _ in range(PASSES):
+        mean = (weights @ (evidence[:, None] * features)) / total[:, None]
+        features = np.where(total[:, None] > 0, mean, features) if dtype is np.longdouble else mean
+    return features
 
 
 @case("smoothed, {name}", name=CLOUDS)

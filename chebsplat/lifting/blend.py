@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,13 +21,34 @@ BELIEVED = 0.6, 0.7  # share of labels of shape that equal those of a teacher su
 LEAST_SHARE = 0.5  # strength, in mean evidence of a Gaussian that is seen
 
 
+class Shape(NamedTuple):
+    """What knowledge of shape answers for N Gaussians.
+
+    answers:       g, f32 [N, C], the surer the longer.
+    embeddings:    [L, C] of the scene's labels.
+    confused_with: i64 [L], the label that shape mostly gives to things of each label.
+    """
+
+    answers: np.ndarray
+    embeddings: np.ndarray
+    confused_with: np.ndarray
+
+    def beside(self, features: np.ndarray) -> np.ndarray:
+        """Answers that count beside features of views [N, C]: zero where shape gives the label that
+        it would give to a thing of the views' label just as well.
+        """
+        seen, given = (decode_labels(of, self.embeddings) for of in (features, self.answers))
+        blind = (self.confused_with[seen] == given) & (seen != given)
+        return np.where(blind[:, None], 0, self.answers).astype(np.float32)
+
+
 class Calibration(NamedTuple):
     """Choices that the training views decide.
 
     smooth:   features are smoothed before they are blended.
     strength: k, views that knowledge counts for; 0: it is left out.
-    curve:    for off and on, the agreement of the halves, mean cosine, at each strength that was
-      tried.
+    curve:    agreement of the halves, mean cosine: for off at each strength that was tried, for on
+      of smoothed features without knowledge.
     """
 
     smooth: bool
@@ -149,68 +170,72 @@ def believed(
     return max(alike_enough, 1 - worth)
 
 
-def halves_agree(halves: np.ndarray, half_views: np.ndarray) -> float:
-    """Agreement of the two halves of the training views: mean cosine, as in `calibrate`, of
-    features as they are. 0 without a Gaussian that both see.
+def halves_agree(
+    halves: np.ndarray, half_views: np.ndarray, refined: Sequence[np.ndarray] | None = None
+) -> float:
+    """Agreement of the two halves of the training views: mean cosine, by views, of what is made of
+    one half and the other half as it is, both ways. 0 without a Gaussian that both see.
 
-    Args: halves [2, N, C], features by each half; half_views [2, N] how many of them see each.
+    Args: halves [2, N, C], features by each half; half_views [2, N] how many of them see each;
+      refined: what is made of each half, None: nothing.
     """
-    weights = np.where((half_views > 0).all(0), half_views.sum(0), 0).astype(np.float64)
-    return float(weights @ cosines(*halves) / max(float(weights.sum()), 1.0))
+    weights = np.where((half_views > 0).all(0), half_views, 0).astype(np.float64)
+    return _agreement(list(halves) if refined is None else refined, halves, weights)
+
+
+def _agreement(made: Sequence[np.ndarray], halves: np.ndarray, weights: np.ndarray) -> float:
+    """Mean cosine of what is made of each half and the other half, weighted by the other's
+    [2, N].
+    """
+    both = sum(float(weights[1 - own] @ cosines(made[own], halves[1 - own])) for own in (0, 1))
+    return both / max(float(weights.sum()), 1e-30)
 
 
 def calibrate(
     halves: np.ndarray,
     half_views: np.ndarray,
     near: Affinities,
-    knowledge: np.ndarray | None = None,
+    shape: Shape | None = None,
     alike: float = ALIKE,
 ) -> Calibration:
     """Choice of smoothing and of knowledge's strength: those by which half the views predict the
     rest.
 
     Args: halves [2, N, C], features by each half of the training views; half_views [2, N] how many
-      of them see each; near: affinities of the Gaussians; knowledge [N, C], or None: only smoothing
-      is decided; alike: as for `effective`.
+      of them see each; near: affinities of the Gaussians; shape: None: only smoothing is decided;
+      alike: as for `effective`.
     Returns: whether smoothing alone makes the halves agree better, and the strength at which they
-      agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up; that share falls
-      to 0 with `alike`, since halves show errors that are not alike. Agreement is the
-      cosine between what is made of one half (smoothed, blended by its own views) and the other
-      half's mean features, averaged over the Gaussians that both see, by the other half's views,
-      both ways alike.
-    Choices: no test view is looked at, and no label. On ties, and without a Gaussian that both
+      agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up; both fall to 0
+      with `alike`, since halves show errors that are not alike. Agreement is the cosine between
+      what is made of one half (smoothed, or blended by its own views) and the other half's mean
+      features, averaged over the Gaussians that both see, by the other half's views and, where
+      there is shape, every label of the views alike, both ways alike.
+    Choices: no test view is looked at, and no true label. On ties, and without a Gaussian that both
       halves see, what changes less wins. The strength is that for features as they are: what
       smoothing has made of a half is no longer evidence of its views alone, and asks for less.
+      Every label counts as much as another, as in mIoU: walls would choose for all.
     """
-    strengths, reliability = (
-        STRENGTHS if knowledge is not None else STRENGTHS[:1],
-        reliable(halves, half_views),
-    )
+    reliability = reliable(halves, half_views)
     weights = np.where((half_views > 0).all(0), half_views, 0).astype(np.float64)
-    curve: dict[str, dict[float, float]] = {"off": {}, "on": {}}
-    for name in curve:
-        variants = [
-            smooth(*of, near) if name == "on" else of[0]
-            for of in zip(halves, half_views, strict=True)
-        ]
-        for k in strengths:
-            agreed = 0.0
-            for own, other in ((0, 1), (1, 0)):
-                evidence = effective(half_views[own], alike) * reliability
-                blended = (
-                    variants[own]
-                    if knowledge is None
-                    else blend(variants[own], evidence, knowledge, k)
-                )
-                agreed += float(weights[other] @ cosines(blended, halves[other]))
-            curve[name][k] = agreed / max(float(weights.sum()), 1.0)
-    evidence, visible = effective(half_views.sum(0), alike) * reliability, half_views.any(0)
-    least = math.inf
-    if weights.any():
-        least = max(LEAST, LEAST_SHARE * float(evidence[visible].mean()) * alike / ALIKE)
-    tried = [k for k in strengths if k >= least]
-    strength = max(tried, key=lambda k: (curve["off"][k], -k), default=0.0)
-    return Calibration(curve["on"][0.0] > curve["off"][0.0], strength, curve)
+    if shape is not None:
+        seen = decode_labels((half_views[..., None] * halves).sum(0), shape.embeddings)
+        weights /= np.maximum(np.bincount(seen, weights.sum(0)), 1)[seen]
+    smoothed = [smooth(*of, near) for of in zip(halves, half_views, strict=True)]
+    curve = {0.0: _agreement(list(halves), halves, weights)}
+    on = _agreement(smoothed, halves, weights)
+    strength = 0.0
+    if shape is not None and weights.any():
+        evidence = [effective(n, alike) * reliability for n in half_views]
+        knowledge = [shape.beside(half) for half in halves]
+        for k in STRENGTHS[1:]:
+            blended = [blend(*of, k) for of in zip(halves, evidence, knowledge, strict=True)]
+            curve[k] = _agreement(blended, halves, weights)
+        whole, visible = effective(half_views.sum(0), alike) * reliability, half_views.any(0)
+        least = max(LEAST, LEAST_SHARE * float(whole[visible].mean())) * alike / ALIKE
+        strength = max(
+            (k for k in STRENGTHS if k >= least), key=lambda k: (curve[k], -k), default=0.0
+        )
+    return Calibration(on > curve[0.0], strength, {"off": curve, "on": {0.0: on}})
 
 
 def start(which: str, lifted: np.ndarray, trained: np.ndarray | None) -> np.ndarray:

@@ -17,6 +17,7 @@ REACH = 0.3  # metres, of neighbours
 DISTANCE, PLANE = 0.15, 0.03
 # the same of a colour's difference, of [0, 1] a channel, and of the normals' angle, rad
 COLOR, ANGLE = 0.1, 0.5
+PASSES = 3  # of smoothing: a fourth gains little, and later ones carry labels over edges
 HALF_EXTENT = 2.7  # metres from the middle that half of a furnished room's Gaussians lie within
 # Gaussians, evenly of all, whose distance to the 8th nearest separates the room from what lies far
 # behind it: there it is more than APART times what it is for the quarter that lies closest.
@@ -110,23 +111,26 @@ def _without_self(neighbors: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return others
 
 
-def smooth(features: np.ndarray, evidence: np.ndarray, near: Affinities) -> np.ndarray:
-    """Features of each Gaussian and its neighbours, averaged by affinity and evidence, f32 [N, C].
+def smooth(
+    features: np.ndarray, evidence: np.ndarray, near: Affinities, passes: int = PASSES
+) -> np.ndarray:
+    """Features of each Gaussian and its neighbours, averaged by affinity and evidence as many times
+    as there are passes, f32 [N, C].
 
         f̃_i = (e_i f_i + Σ_j w_ij e_j f_j) / (e_i + Σ_j w_ij e_j)
 
     Args: features [N, C]; evidence [N] >= 0, such as the number of views; near: of the same
       Gaussians.
-    Choices: once, not until nothing changes: every further pass carries labels over edges. Where
-      neither a Gaussian nor a neighbour has evidence the features stay what they are.
+    Choices: where neither a Gaussian nor a neighbour has evidence the features stay what they are.
     """
     evidence, smoothed = evidence.astype(np.float32), features.astype(np.float32)
-    weighted = smoothed * evidence[:, None]
-    for start in range(0, len(features), ROWS):
-        rows = slice(start, start + ROWS)
-        index, weights = near.neighbors[rows], near.weights[rows]
-        total = evidence[rows] + (weights * evidence[index]).sum(1)
-        sums = weighted[rows] + (weights[:, None] @ weighted[index])[:, 0]
-        some = total > 0
-        smoothed[rows][some] = sums[some] / total[some, None]
+    for _ in range(passes):
+        weighted = smoothed * evidence[:, None]
+        for start in range(0, len(features), ROWS):
+            rows = slice(start, start + ROWS)
+            index, weights = near.neighbors[rows], near.weights[rows]
+            total = evidence[rows] + (weights * evidence[index]).sum(1)
+            sums = weighted[rows] + (weights[:, None] @ weighted[index])[:, 0]
+            some = total > 0
+            smoothed[rows][some] = sums[some] / total[some, None]
     return smoothed

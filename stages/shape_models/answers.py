@@ -73,6 +73,23 @@ def into_channels(
     return lambda answers: shares(answers[:, half:], embeddings, TEMPERATURE) @ codes
 
 
+def confused_with(path: Path, knowledge: Knowledge, features: Features) -> np.ndarray:
+    """For each of a scene's labels the label that shape mostly gives to things of it, i64 [L]: its
+    own, where shape tells it or was not taught it.
+
+    Args: knowledge: read from `path`.
+    Raises: as `into_channels`.
+    Choices: what shape mostly gives is the answer at the class's mean: a keyboard's is a desk.
+    """
+    rows = np.array(match_names(features.label_names, knowledge.classes), np.int64)
+    own = np.arange(len(rows))
+    if (rows < 0).all():
+        return own
+    answers = into_channels(path, knowledge, features)(knowledge.class_means @ knowledge.map)
+    given = decode_labels(answers, features.label_embeddings)
+    return np.where(rows >= 0, given[rows], own)
+
+
 def into_meanings(
     path: Path, knowledge: Knowledge, features: Features
 ) -> Callable[[int], np.ndarray]:

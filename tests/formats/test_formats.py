@@ -194,10 +194,9 @@ def make_knowledge():
     )
     of = "a", "b", {"n_channels": 3}, weights, matrix, {"n_angles": 8}
     words = ["sofa", "wall"], np.eye(2, 3, dtype=np.float16)
+    classes = np.ones(7, np.float32), ["wall"], np.ones((1, 7), np.float32)
     card = {"n_rooms": 2}, {"share": 3.0}
-    return knowledge.Knowledge(
-        *of, *words, *answers, np.ones(7, np.float32), *card, [make_sums()] * 2
-    )
+    return knowledge.Knowledge(*of, *words, *answers, *classes, *card, [make_sums()] * 2)
 
 
 CASES = {

@@ -335,6 +335,8 @@ def _knowledge(out: Path) -> None:
         np.ones((FEATURES, C), np.float32),
         np.eye(FEATURES, 2, dtype=np.float32),
         np.ones(FEATURES, np.float32),
+        ["wall"],
+        np.ones((1, FEATURES), np.float32),
     )
     knowledge = Knowledge(
         "tiny", "0" * 64, encoder, weights, matrix, describe, *words, *answers, card

@@ -61,7 +61,7 @@ def start():
         "basis": np.eye(P)[:, :3],
         "scale": scale_of(whole),
     }
-    return Knowledge(**of, card={}, shipped=shipped)
+    return Knowledge(**of, classes=[], class_means=np.zeros((0, P)), card={}, shipped=shipped)
 
 
 def test_a_lesson_is_trusted_as_far_as_shape_and_teacher_are_of_one_mind():

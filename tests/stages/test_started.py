@@ -38,7 +38,7 @@ def page_of(folder, refined=REFINED, lesson=LESSON, lessons=SOLVED, knowledge=Tr
     card = {"n_rooms": 80}
     made = {"refined": ("refined/2", "refine", refined), "learned": ("lesson/1", "learn", lesson)}
     if knowledge:
-        made["knowledge"] = ("knowledge/2", stage, card)
+        made["knowledge"] = ("knowledge/3", stage, card)
     for role, (schema, by, facts) in made.items():
         if facts is not None:
             manifest = Manifest(f"chebsplat.{schema}", KEY, by, facts=facts, seconds=272.0)

@@ -26,7 +26,13 @@ from chebsplat.stages.recall import combine_lessons
 from chebsplat.stages.registry import OF_KNOWLEDGE
 from chebsplat.stages.settings import TeachSection
 from chebsplat.stages.shape_models import surfaces, teaching_rooms
-from chebsplat.stages.shape_models.answers import TEMPERATURE, answered, into_channels, units
+from chebsplat.stages.shape_models.answers import (
+    TEMPERATURE,
+    answered,
+    confused_with,
+    into_channels,
+    units,
+)
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.synthetic import CLASS_NAMES
 from chebsplat.synthetic.layout import HELD_OUT, KNOWLEDGE, REFERENCE, SCENES, TRAINING
@@ -118,15 +124,30 @@ def test_a_half_seen_room_is_what_few_photos_show_and_is_taught_all(network, mon
 
 
 def test_what_ships_is_whole_small_and_says_what_it_was_taught():
-    manifest = artifact.verify(SHIPPED, "chebsplat.knowledge/2")
+    manifest = artifact.verify(SHIPPED, "chebsplat.knowledge/3")
     knowledge = read_knowledge(SHIPPED)
     assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < 5_000_000
     assert "/" not in json.dumps(manifest.config)  # no path of the machine that taught it
     assert knowledge.card["n_rooms"] >= 64
     assert knowledge.card["held_out"]["shape"] > 0.8
     assert set(CLASS_NAMES) <= set(knowledge.words)
+    np.testing.assert_allclose(knowledge.class_means[:, -1], 1, atol=1e-4)
     # no lesson adds nothing
     np.testing.assert_allclose(combine_lessons(knowledge, {}).map, knowledge.map, atol=1e-4)
+
+
+@pytest.mark.xdist_group("toy")
+def test_what_ships_takes_a_keyboard_for_its_desk_and_tells_all_else_that_it_was_taught(toy):
+    knowledge, features = read_knowledge(SHIPPED), Features.read(toy["teacher"])
+    assert knowledge.classes == list(CLASS_NAMES)
+    codes = np.eye(len(CLASS_NAMES) + 1, dtype=np.float32)
+    features.label_names = ["escalator", *CLASS_NAMES]  # which it was not taught
+    features.label_embeddings = codes
+    found = confused_with(SHIPPED, knowledge, features)
+    names = features.label_names
+    assert {names[k]: names[of] for k, of in enumerate(found) if of != k} == {"keyboard": "desk"}
+    features.label_names, features.label_embeddings = ["escalator"], codes[:1]
+    assert list(confused_with(SHIPPED, knowledge, features)) == [0]
 
 
 @pytest.mark.xdist_group("toy")

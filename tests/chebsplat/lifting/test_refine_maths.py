@@ -11,6 +11,7 @@ from chebsplat.lifting.blend import (
     ALIKE,
     LEAST,
     STRENGTHS,
+    Shape,
     believed,
     blend,
     calibrate,
@@ -25,6 +26,7 @@ from chebsplat.lifting.blend import (
 from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import (
     N_NEIGHBORS,
+    PASSES,
     REACH,
     Affinities,
     affinities,
@@ -79,11 +81,12 @@ def test_smoothing_is_its_formula_in_scenes_of_any_unit(scene, scale):
     means, normals, colors, features, evidence = scene
     near = affinities(means * scale + 7 * scale, normals, colors, scale)
     assert ((near.weights > 0).sum(1) == N_NEIGHBORS).any()
-    found = smooth(features, evidence, near)
-    # float32 features and weights
-    np.testing.assert_allclose(
-        found, transcribed(means, normals, colors, features, evidence, 1.0), atol=1e-5
-    )
+    expected = features
+    for passes in range(1, PASSES + 1):
+        expected = transcribed(means, normals, colors, expected, evidence, 1.0)
+        found = smooth(features, evidence, near, passes)
+        np.testing.assert_allclose(found, expected, atol=1e-5)  # float32 features and weights
+    np.testing.assert_array_equal(smooth(features, evidence, near), found)
     assert np.abs(found - features).max() > 0.1
 
 
@@ -174,9 +177,31 @@ def test_errors_of_views_are_told_to_be_their_own_or_their_neighbours_too():
 
 def test_where_errors_are_not_alike_many_views_outweigh_knowledge_that_is_wrong():
     halves, n_views, truth, near = votes(100, 0.02)
-    wrong = truth[:, ::-1].copy()
+    wrong = answering(truth[:, ::-1].copy())
     assert calibrate(halves, n_views, near, wrong).strength > LEAST
-    assert calibrate(halves, n_views, near, wrong, 0.0).strength == LEAST
+    assert calibrate(halves, n_views, near, wrong, 0.0).strength == 0
+
+
+def test_every_label_decides_alike_how_strong_knowledge_is():
+    halves, n_views, truth, near = votes(2, 0.3, rare=0.05)
+    rare = truth[:, 1] > 0
+    assert 5 < rare.sum() < 40
+    halves[:, rare] = truth[rare]  # on which all views agree
+    blind = answering(np.eye(4)[np.zeros(400, int)])  # right about the frequent label alone
+    evidence = effective(n_views[0], 0.0) * reliable(halves, n_views)
+    by_views = [
+        (unit(blend(halves[0], evidence, blind.answers, k)) * halves[1]).sum() for k in STRENGTHS
+    ]
+    assert calibrate(halves, n_views, near, blind, 0.0).strength < STRENGTHS[np.argmax(by_views)]
+
+
+def test_shape_has_no_vote_where_views_tell_what_it_takes_for_the_same():
+    desk, keyboard, lamp = labels = np.eye(3)
+    answers = np.stack([desk, desk, desk, lamp, 0.5 * desk]).astype(np.float32)
+    seen = np.stack([desk, keyboard, lamp, keyboard, 2 * keyboard])
+    blind = Shape(answers, labels, np.array([0, 0, 2]))  # a keyboard is a desk to it
+    np.testing.assert_array_equal(blind.beside(seen).any(1), [True, False, True, True, False])
+    np.testing.assert_array_equal(Shape(answers, labels, np.arange(3)).beside(seen), answers)
 
 
 def test_what_is_refined_lies_midway_between_trained_and_lifted_and_is_as_long_as_the_trained():
@@ -242,13 +267,18 @@ def test_confidence_grows_with_votes_that_agree_and_falls_where_they_do_not():
     np.testing.assert_allclose(nothing, [0, 1 / 2, 3 / 4, 3 / 4], atol=1e-6)
 
 
-def votes(n_views, spread, seed=0):
+def answering(answers):
+    """Shape that tells all four labels of `votes` apart."""
+    return Shape(answers.astype(np.float32), np.eye(4), np.arange(4))
+
+
+def votes(n_views, spread, seed=0, rare=0.5):
     """Halves of a plane of 400 Gaussians of two materials, what is true of them, and their
     affinities.
     """
     rng = np.random.default_rng(seed)
     means = np.concatenate([rng.uniform(0, 1, (400, 2)), np.zeros((400, 1))], 1)
-    second = means[:, 0] > 0.5
+    second = means[:, 0] > 1 - rare
     truth = np.eye(4)[second.astype(int)]
     halves = np.stack(
         [unit(truth + spread / np.sqrt(n_views) * rng.normal(size=truth.shape)) for _ in "ab"]
@@ -277,6 +307,10 @@ def test_the_halves_agree_as_calibration_has_it():
     assert halves_agree(halves, n_views) == pytest.approx(
         calibrate(halves, n_views, near).curve["off"][0.0]
     )
+    smoothed = [smooth(*of, near) for of in zip(halves, n_views, strict=True)]
+    assert halves_agree(halves, n_views, smoothed) == pytest.approx(
+        calibrate(halves, n_views, near).curve["on"][0.0]
+    )
     assert halves_agree(halves[[0, 0]], n_views) == pytest.approx(1)
     assert halves_agree(halves, n_views * np.array([[1], [0]])) == 0
 
@@ -288,7 +322,7 @@ def test_calibration_trusts_knowledge_as_far_as_views_are_noisy():
         # knowledge errs, too
         wrong = np.where(np.arange(400)[:, None] % 10 == 0, np.eye(4)[3], truth)
         near = Affinities(near.neighbors, np.zeros_like(near.weights))
-        found = calibrate(halves, n_views, near, wrong)
+        found = calibrate(halves, n_views, near, answering(wrong))
         assert set(found.curve["off"]) == set(STRENGTHS)
         assert not found.smooth  # nobody has a neighbour: a tie
         evidence = effective(n_views.sum(0)) * reliable(halves, n_views)
@@ -299,6 +333,7 @@ def test_calibration_trusts_knowledge_as_far_as_views_are_noisy():
 
 def test_calibration_treats_both_halves_alike_and_ignores_what_one_half_does_not_see():
     halves, n_views, truth, near = votes(2, 1.0)
+    truth = answering(truth)
     turned = calibrate(halves[::-1], n_views[::-1], near, truth)
     there = calibrate(halves, n_views, near, truth)
     assert turned[:2] == there[:2]
