@@ -66,6 +66,9 @@ BENCHMARKS = {
     "lessons": Benchmark(
         "teachers.lessons", "what lessons of scenes, and labelled points, are worth in other scenes"
     ),
+    "opensplat": Benchmark(
+        "others.opensplat", "OpenSplat on the CPU beside ours at equal seconds; args=--binary FILE"
+    ),
     "unposed": Benchmark(
         "scenes.unposed",
         "poses of photos that come alone, beside pycolmap's defaults; args=FOLDERS",

@@ -34,6 +34,7 @@ SMALLEST = {
     "label": "--scenes toy --steps 20",
     "teaching": "--rooms 1 --held-out 1 --seeds 0 --steps 3 --rooms-in {out}/rooms",
     "lessons": "--scenes {name} {name}",
+    "opensplat": "--scenes toy --seconds 3 --binary {standin}",
     "unposed": "{photos}",
     "lenses": "--views 1",
     "query": "--folders {work}",
@@ -90,12 +91,41 @@ def capture_of_photos(folder):
     return folder
 
 
+STANDIN = """
+import sys, time
+from pathlib import Path
+import numpy as np, pycolmap
+from chebsplat.formats.ply import write_ply
+folder, out = Path(sys.argv[1]), Path(sys.argv[sys.argv.index("-o") + 1])
+model = pycolmap.Reconstruction(folder / "sparse/0")
+means = np.array([point.xyz for point in model.points3D.values()], np.float32)
+parameters = {"means": means, "log_scales": np.full((len(means), 3), -4, np.float32)}
+parameters["quats"] = np.tile(np.float32([1, 0, 0, 0]), (len(means), 1))
+parameters["logit_opacities"] = np.zeros(len(means), np.float32)
+parameters |= {"sh0": np.zeros((len(means), 1, 3), np.float32)}
+parameters["shN"] = np.zeros((len(means), 15, 3), np.float32)
+for step in range(10, 100_000, 10):
+    print(f"Step {step}: 0.1 (0%)", flush=True)
+    write_ply(out.with_name(f"splat_{step}.ply"), parameters, 3)
+    time.sleep(0.3)
+"""
+
+
+def opensplat_standin(folder):
+    """A program that is called and ends as OpenSplat, and trains nothing."""
+    path = folder / "opensplat"
+    path.write_text(f"#!{sys.executable}{STANDIN}")
+    path.chmod(0o755)
+    return path
+
+
 @pytest.mark.slow
 @pytest.mark.xdist_group("benchmarks")
 @pytest.mark.parametrize("name", sorted(bench.BENCHMARKS.keys() - BY_ITSELF))
 def test_a_benchmark_runs_to_its_end_at_its_smallest_size(name, work, tmp_path, monkeypatch):
     photos = capture_of_photos(tmp_path / "photos") if name == "unposed" else ""
     words = {"work": work, "name": work.name, "out": tmp_path, "photos": photos}
+    words["standin"] = opensplat_standin(tmp_path)
     if name == "teaching":
         from benchmarks.teachers import teaching
 

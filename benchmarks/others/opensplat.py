@@ -1,0 +1,130 @@
+"""OpenSplat on the CPU beside ours: same photos, poses, points and seconds of training, all cores.
+
+Build it first by opensplat.sh, which has the commands. It gets what `chebsplat extract` writes of a
+scene, less the test views, and trains in two forms, of which the better counts: as it comes, and
+at the photos' size from the start on a schedule that ends when its seconds do. Both systems' test
+views are rendered and measured by this project, colour only.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks import shared
+from chebsplat.formats.capture import Capture
+from chebsplat.formats.gaussians import Gaussians
+from chebsplat.formats.ply import read_ply
+from chebsplat.formats.points import Points
+from chebsplat.formats.world import World
+from chebsplat.render import SceneRenderer
+from chebsplat.stages.measuring.image_quality import image_figures
+from chebsplat.stages.tools.camera_files import write_capture
+from chebsplat.views import View
+
+SCENES = ("fox", "redkitchen", "office0", "kitchen")
+ITERATIONS = 30_000  # OpenSplat's own
+EVERY = 10  # steps between two files of it, and between two lines of progress
+
+
+def of_training(capture: Capture, points: Points) -> Points:
+    """The points, with the registered views that are trained on alone."""
+    test = {name for name, is_test in zip(capture.names, capture.is_test, strict=True) if is_test}
+    kept = [view for view, name in enumerate(points.names) if name not in test]
+    place = {view: k for k, view in enumerate(kept)}
+    tracks = [(point, place[view]) for point, view in points.tracks.tolist() if view in place]
+    points.names = [points.names[view] for view in kept]
+    points.Ks, points.cam_from_world = points.Ks[kept], points.cam_from_world[kept]
+    points.tracks = np.array(tracks, np.int32).reshape(-1, 2)
+    return points
+
+
+def trained(
+    binary: Path, folder: Path, out: Path, seconds: float, options: Sequence[str]
+) -> tuple[Path, int]:
+    """The last PLY that OpenSplat has written after so many seconds of steps, and its step.
+
+    Args: options: of OpenSplat, -n and the number of steps first.
+    """
+    out.mkdir()
+    command = [binary, folder, "-o", out / "splat.ply", "--keep-crs", "--cpu", *options]
+    with subprocess.Popen(
+        [*map(str, command), "--save-every", str(EVERY)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        ends = None
+        for line in process.stdout:
+            if ends is None and line.startswith("Step"):  # EVERY steps are done
+                ends = time.monotonic() + seconds
+            if ends is not None and time.monotonic() > ends:
+                process.kill()
+                break
+    if (out / "splat.ply").exists():
+        return out / "splat.ply", int(options[1])
+    written = sorted(out.glob("splat_*.ply"), key=lambda path: int(path.stem.split("_")[1]))
+    last = written[-2]  # the last may be half written
+    return last, int(last.stem.split("_")[1])
+
+
+def measured(
+    capture: Capture, gaussians: Gaussians, parameters: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    """PSNR and SSIM of the test views, with the cameras of our training."""
+    cameras, row = gaussians.cameras, {name: k for k, name in enumerate(capture.names)}
+    renderer = SceneRenderer(parameters, "cpu", cameras.Ks)
+    views = [k for k, name in enumerate(cameras.names) if capture.is_test[row[name]]]
+    renders = []
+    for k in views:
+        K, pose = (torch.from_numpy(m[k]).float() for m in (cameras.Ks, cameras.cam_from_world))
+        renders.append(renderer.render(View(K, pose, cameras.width, cameras.height))[0])
+    rows = [row[cameras.names[k]] for k in views]
+    masks = None if capture.loss_mask is None else [capture.loss_mask[k] for k in rows]
+    figures = image_figures(np.stack(renders), np.stack([capture.images[k] for k in rows]), masks)
+    return {
+        "psnr": round(figures["psnr"], 2),
+        "ssim": round(figures["ssim"], 4),
+        "n_gaussians": len(parameters["means"]),
+    }
+
+
+def main(arguments: Sequence[str]) -> int:
+    parser = shared.parser("opensplat", __doc__)
+    parser.add_argument("--binary", type=Path, required=True, help="built by opensplat.sh")
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
+    parser.add_argument("--seconds", type=float, default=120, help="of training")
+    options = parser.parse_args(arguments)
+    print(shared.machine(), flush=True)
+    rows: list[dict[str, Any]] = []
+
+    def add(scene: str, system: str, steps: int, figures: dict[str, Any]) -> None:
+        rows.append({"scene": scene, "system": system, "steps": steps} | figures)
+        print(" ".join(f"{value!s:>14}" for value in rows[-1].values()), flush=True)
+
+    for scene in shared.there(options.scenes):
+        settings = f"teacher.kind=none,train.seconds={options.seconds:g}"
+        plan = shared.finished([(scene, settings)], "train")[0]
+        artifacts = plan.targets
+        capture, gaussians = Capture.read(artifacts["ingest"]), Gaussians.read(artifacts["train"])
+        steps = int(gaussians.trace[-1]["step"])
+        add(scene, "ours", steps, measured(capture, gaussians, gaussians.parameters))
+        with TemporaryDirectory() as place:
+            folder = Path(place) / "capture"
+            write_capture(folder, capture, of_training(capture, Points.read(artifacts["sfm"])))
+            (folder / "transforms.json").unlink()  # it would be read, without the points
+            steps = ITERATIONS
+            for name, form in (("as it comes", []), ("all pixels", ["--num-downscales", "0"])):
+                out = Path(place) / name.replace(" ", "-")
+                form = ["-n", str(steps), *form]  # as many as the form before could
+                ply, steps = trained(options.binary, folder, out, options.seconds, form)
+                parameters, degree, _ = read_ply(ply, World.read(capture.source))
+                parameters["degrees"] = np.full(len(parameters["means"]), degree, np.uint8)
+                add(scene, f"OpenSplat, {name}", steps, measured(capture, gaussians, parameters))
+    shared.write_csv(options.out / "opensplat.csv", rows)
+    return 0
