@@ -37,7 +37,7 @@ class Knowledge:
     classes:    K classes that it was taught; class_means f32 [K, p], the mean features of shape of
       each, by which the classes are found that shape does not tell apart.
     card:       training facts; for each kind of room held out, the shares of points named right
-      (`stages.teach.measured`) and, in `novelty`, the largest ρ′.
+      (`stages.teach.measure_accuracy`) and, in `novelty`, the largest ρ′.
     lessons:    the lessons it was solved from, in `of`: of each its key, scene, trust, the reason,
       and whether it is new in kind. Empty in what ships.
     shipped:    mean sums of the generated rooms, by parts of them; none in what a scene has solved.

@@ -1,8 +1,6 @@
-"""refine: smooth the features of a finished scene and blend them with knowledge of shape."""
+"""refine: blend the features of a finished scene with knowledge of shape, and smooth them."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
@@ -41,7 +39,8 @@ REACH = 0.15  # metres from swept points, where an answer is half as long
 
 
 def run(job: Job) -> None:
-    """Smooth the features of trained Gaussians, blend in knowledge (docs/method.md, section 13).
+    """Blend knowledge into the features of trained Gaussians, and smooth (docs/method.md, section
+    13).
 
     Reads `gaussians` and `lifted`; for the scene's unit `capture`; for knowledge `knowledge`,
     `descriptors`, `encoding` and `features`, by which the share of labels that change is counted,
@@ -58,6 +57,11 @@ def run(job: Job) -> None:
         raise InputError(
             f"{job.inputs['lifted']} is of {len(lifted.features)} Gaussians, not "
             f"{len(p['means'])}; lift again"
+        )
+    taught = Features.read(job.inputs["features"]) if "features" in job.inputs else None
+    if taught is not None and taught.label_embeddings.shape[1] != lifted.features.shape[1]:
+        raise InputError(
+            f"{job.inputs['features']} has other channels than the checkpoint; pass its own"
         )
     trained = p.get("features")
     capture = Capture.read(job.inputs["capture"]) if "capture" in job.inputs else None
@@ -80,44 +84,43 @@ def run(job: Job) -> None:
     smoothed = choice.smooth if settings.smooth == "auto" else settings.smooth == "on"
     strength = choice.strength
     known_to_teacher = belief = 1.0
-    own = [features, *lifted.halves]
-    views = [lifted.n_views, *lifted.half_views]
-    alone = [smooth(*of, near) for of in zip(own, views, strict=True)] if smoothed else own
-    refined, knowledge = alone, None
+    knowledge = None
     if shape is not None:
         known_to_teacher = familiar(lifted.features, shape.answers, shape.embeddings)
         belief = believed(
             lifted.features, lifted.n_views, shape.answers, shape.embeddings, known_to_teacher
         )
         strength *= belief
-    if shape is not None and strength > 0:
-        weight = reliable(lifted.halves, lifted.half_views) * known_to_teacher
-        refined = []
-        for of, n in zip(own, views, strict=True):
-            answers, evidence = shape.beside(of), effective(n, alike) * weight
-            blended = blend(of, evidence, answers, strength)
-            votes = evidence + trusted(answers, strength)
-            refined.append(smooth(blended, votes, near) if smoothed else blended)
         knowledge = shape.beside(features)
+    reliability = reliable(lifted.halves, lifted.half_views) * known_to_teacher
+
+    def refine(of: np.ndarray, n_views: np.ndarray) -> np.ndarray:
+        """Features by so many views, blended and smoothed as was decided."""
+        if shape is None or strength == 0:
+            return smooth(of, n_views, near) if smoothed else of
+        answers, evidence = shape.beside(of), effective(n_views, alike) * reliability
+        blended = blend(of, evidence, answers, strength)
+        return smooth(blended, evidence + trusted(answers, strength), near) if smoothed else blended
+
+    alone = smooth(features, lifted.n_views, near) if smoothed else features
+    refined = refine(features, lifted.n_views)
+    halves = [refine(*of) for of in zip(lifted.halves, lifted.half_views, strict=True)]
     curve = {
         name: {f"{k:g}": value for k, value in row.items()} for name, row in choice.curve.items()
     }
     notes = {"start": started, "smooth": smoothed, "strength": strength, "curve": curve}
     notes |= {"familiar": known_to_teacher, "believed": belief, "alike": alike}
     sure = confidence(
-        alone[0], lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher, alike
+        alone, lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher, alike
     )
-    Refined(refined[0], sure, notes).write(job.out)
-    before, after = (
-        halves_agree(lifted.halves, lifted.half_views, of) for of in (None, refined[1:])
-    )
+    Refined(refined, sure, notes).write(job.out)
+    before, after = (halves_agree(lifted.halves, lifted.half_views, of) for of in (None, halves))
     job.facts |= {"halves_agree": after, "gain": after - before}
-    if capture is not None and "features" in job.inputs:
-        job.facts["right"] = labels_right(
-            capture, p, refined[0], Features.read(job.inputs["features"])
-        )
+    if capture is not None and taught is not None:
+        job.facts["right"] = labels_right(capture, p, refined, taught)
     job.facts |= {"n_gaussians": len(features), "unit": unit, **notes}
-    job.facts |= shares(job, [features, alone[0], refined[0]])
+    if taught is not None:
+        job.facts |= changed_by([features, alone, refined], taught.label_embeddings)
 
 
 def predict_from_shape(job: Job, parameters: dict[str, np.ndarray], unit: float) -> Shape | None:
@@ -174,15 +177,11 @@ def predict_from_shape(job: Job, parameters: dict[str, np.ndarray], unit: float)
     return Shape(carried, features.label_embeddings, taken)
 
 
-def shares(job: Job, steps: list[np.ndarray]) -> dict[str, Any]:
-    """Share of the Gaussians whose label smoothing changes, and knowledge after it."""
-    if "features" not in job.inputs:
-        return {}
-    embeddings = Features.read(job.inputs["features"]).label_embeddings
-    if embeddings.shape[1] != steps[0].shape[1]:
-        raise InputError(
-            f"{job.inputs['features']} has other channels than the checkpoint; pass its own"
-        )
+def changed_by(steps: list[np.ndarray], embeddings: np.ndarray) -> dict[str, float]:
+    """Share of the Gaussians whose label smoothing changes, and that knowledge changes beyond it.
+
+    Args: steps: features without either, smoothed, and with both; embeddings [L, C] of labels.
+    """
     labels = [decode_labels(features, embeddings) for features in steps]
     names = ("changed_by_smoothing", "changed_by_knowledge")
     return {

@@ -153,7 +153,7 @@ STAGES: dict[str, Stage] = {
               (("capture", "ingest"), ("descriptors", "describe"), ("encoding", "encode"),
                ("features", "teacher"), ("knowledge", "recall")),
               megabytes=lambda k: 4 * k.gaussians / 40_000,  # 9, 22; 1083 MB
-              help="Smooth the features of a finished scene and blend them with knowledge, as its "
+              help="Blend the features of a finished scene with knowledge, and smooth them, as its "
                    "training views ask."),
         Stage("export", "chebsplat.scene/5", (), (("gaussians", "train"),),
               (("features", "teacher"), ("lifted", "lift"), ("refined", "refine")),

@@ -97,7 +97,7 @@ def run(job: Job) -> None:
     whole = mean_of(of_rooms)
     scale = scale_of(whole)
     shape_basis = basis(whole, scale)
-    separable = -1 not in named and len(classes) <= len(classes[0])
+    separable = -1 not in named and np.linalg.matrix_rank(classes) == len(classes)
     means, with_points = class_means(whole, units(classes) if separable else classes[:0])
     card = settings.model_dump(mode="json", exclude={"model", "seed"})
     newest: dict[str, float] = {}

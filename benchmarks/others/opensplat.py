@@ -1,9 +1,10 @@
 """OpenSplat on the CPU beside ours: same photos, poses, points and seconds of training, all cores.
 
 Build it first by opensplat.sh, which has the commands. It gets what `chebsplat extract` writes of a
-scene, less the test views, and trains in two forms, of which the better counts: as it comes, and
-at the photos' size from the start on a schedule that ends when its seconds do. Both systems' test
-views are rendered and measured by this project, colour only.
+scene, less the test views, and trains in two forms, of which the better counts: on its own schedule
+of 30,000 steps, cut off, and on one of as many steps as those took; both at a quarter of the size,
+as it starts by itself: a step at full size takes seconds. Both systems' test views are rendered and
+measured by this project, colour only.
 """
 
 from __future__ import annotations
@@ -31,11 +32,11 @@ from chebsplat.views import View
 
 SCENES = ("fox", "redkitchen", "office0", "kitchen")
 ITERATIONS = 30_000  # OpenSplat's own
-EVERY = 10  # steps between two files of it, and between two lines of progress
+EVERY = 25  # steps between two files of it
 
 
-def of_training(capture: Capture, points: Points) -> Points:
-    """The points, with the registered views that are trained on alone."""
+def keep_training_views(capture: Capture, points: Points) -> Points:
+    """Points, in place, with the registered views that are trained on alone."""
     test = {name for name, is_test in zip(capture.names, capture.is_test, strict=True) if is_test}
     kept = [view for view, name in enumerate(points.names) if name not in test]
     place = {view: k for k, view in enumerate(kept)}
@@ -46,34 +47,38 @@ def of_training(capture: Capture, points: Points) -> Points:
     return points
 
 
-def trained(
-    binary: Path, folder: Path, out: Path, seconds: float, options: Sequence[str]
+def train_opensplat(
+    binary: Path, folder: Path, out: Path, seconds: float, steps: int
 ) -> tuple[Path, int]:
     """The last PLY that OpenSplat has written after so many seconds of steps, and its step.
 
-    Args: options: of OpenSplat, -n and the number of steps first.
+    Args: steps: of its schedule, all made if they take no longer.
     """
     out.mkdir()
-    command = [binary, folder, "-o", out / "splat.ply", "--keep-crs", "--cpu", *options]
+    command = [binary, folder, "-o", out / "splat.ply", "--keep-crs", "--cpu", "-n", steps]
     with subprocess.Popen(
         [*map(str, command), "--save-every", str(EVERY)], stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
         ends = None
         for line in process.stdout:
-            if ends is None and line.startswith("Step"):  # EVERY steps are done
+            if ends is None and line.startswith("Step"):
                 ends = time.monotonic() + seconds
             if ends is not None and time.monotonic() > ends:
                 process.kill()
                 break
+    if process.returncode > 0:
+        raise SystemExit(f"OpenSplat failed with exit code {process.returncode}")
     if (out / "splat.ply").exists():
-        return out / "splat.ply", int(options[1])
+        return out / "splat.ply", steps
     written = sorted(out.glob("splat_*.ply"), key=lambda path: int(path.stem.split("_")[1]))
-    last = written[-2]  # the last may be half written
+    if len(written) < 2:  # the last may be half written
+        raise SystemExit(f"OpenSplat made fewer than {2 * EVERY} steps; raise --seconds")
+    last = written[-2]
     return last, int(last.stem.split("_")[1])
 
 
-def measured(
+def measure_test_views(
     capture: Capture, gaussians: Gaussians, parameters: dict[str, np.ndarray]
 ) -> dict[str, Any]:
     """PSNR and SSIM of the test views, with the cameras of our training."""
@@ -113,18 +118,24 @@ def main(arguments: Sequence[str]) -> int:
         artifacts = plan.targets
         capture, gaussians = Capture.read(artifacts["ingest"]), Gaussians.read(artifacts["train"])
         steps = int(gaussians.trace[-1]["step"])
-        add(scene, "ours", steps, measured(capture, gaussians, gaussians.parameters))
+        add(scene, "ours", steps, measure_test_views(capture, gaussians, gaussians.parameters))
         with TemporaryDirectory() as place:
             folder = Path(place) / "capture"
-            write_capture(folder, capture, of_training(capture, Points.read(artifacts["sfm"])))
+            write_capture(
+                folder, capture, keep_training_views(capture, Points.read(artifacts["sfm"]))
+            )
             (folder / "transforms.json").unlink()  # it would be read, without the points
             steps = ITERATIONS
-            for name, form in (("as it comes", []), ("all pixels", ["--num-downscales", "0"])):
-                out = Path(place) / name.replace(" ", "-")
-                form = ["-n", str(steps), *form]  # as many as the form before could
-                ply, steps = trained(options.binary, folder, out, options.seconds, form)
+            for form in ("cut off", "of as many steps"):
+                out = Path(place) / form.replace(" ", "-")
+                ply, steps = train_opensplat(options.binary, folder, out, options.seconds, steps)
                 parameters, degree, _ = read_ply(ply, World.read(capture.source))
                 parameters["degrees"] = np.full(len(parameters["means"]), degree, np.uint8)
-                add(scene, f"OpenSplat, {name}", steps, measured(capture, gaussians, parameters))
+                add(
+                    scene,
+                    f"OpenSplat, {form}",
+                    steps,
+                    measure_test_views(capture, gaussians, parameters),
+                )
     shared.write_csv(options.out / "opensplat.csv", rows)
     return 0

@@ -137,7 +137,7 @@ def main(arguments: Sequence[str]) -> None:
         return smooth(result, votes, near) if choice.smooth else result
 
     result, to_blend = timed(blended)
-    add("and knowledge", to_lift + to_compare + to_smooth + to_know + to_blend, result)
+    add("and knowledge", to_lift + to_compare + to_know + to_blend, result)
     shared.write_csv(options.out / "refine.csv", rows)
     draw(options.out / "refine.png", rows, options.work.resolve().name)
 

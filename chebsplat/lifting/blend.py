@@ -17,6 +17,8 @@ SURE = 3  # power of its length by which knowledge counts
 AGREED = 6
 # An error that a teacher repeats in both halves counts as agreement, however many views there are.
 LEAST = 1.0  # strength
+# of what both halves see: a label of less has so much less to say about the strength
+LEAST_OF_LABEL = 1e-3
 BELIEVED = 0.6, 0.7  # share of labels of shape that equal those of a teacher sure of the scene
 LEAST_SHARE = 0.5  # strength, in mean evidence of a Gaussian that is seen
 
@@ -34,21 +36,21 @@ class Shape(NamedTuple):
     confused_with: np.ndarray
 
     def beside(self, features: np.ndarray) -> np.ndarray:
-        """Answers that count beside features of views [N, C]: zero where shape gives the label that
-        it would give to a thing of the views' label just as well.
+        """Answers that count beside features of views [N, C], zero where unseen: none where shape
+        gives the label that it mostly gives to things of the label that the views give.
         """
         seen, given = (decode_labels(of, self.embeddings) for of in (features, self.answers))
-        blind = (self.confused_with[seen] == given) & (seen != given)
+        blind = (self.confused_with[seen] == given) & (seen != given) & features.any(1)
         return np.where(blind[:, None], 0, self.answers).astype(np.float32)
 
 
 class Calibration(NamedTuple):
     """Choices that the training views decide.
 
-    smooth:   features are smoothed before they are blended.
+    smooth:   features are smoothed, after they are blended.
     strength: k, views that knowledge counts for; 0: it is left out.
-    curve:    agreement of the halves, mean cosine: for off at each strength that was tried, for on
-      of smoothed features without knowledge.
+    curve:    agreement of the halves, mean cosine, by `calibrate`: for off at each strength that
+      was tried, for on of smoothed features without knowledge.
     """
 
     smooth: bool
@@ -219,7 +221,8 @@ def calibrate(
     weights = np.where((half_views > 0).all(0), half_views, 0).astype(np.float64)
     if shape is not None:
         seen = decode_labels((half_views[..., None] * halves).sum(0), shape.embeddings)
-        weights /= np.maximum(np.bincount(seen, weights.sum(0)), 1)[seen]
+        of_label = np.bincount(seen, weights.sum(0))
+        weights /= np.maximum(of_label, max(LEAST_OF_LABEL * of_label.sum(), 1))[seen]
     smoothed = [smooth(*of, near) for of in zip(halves, half_views, strict=True)]
     curve = {0.0: _agreement(list(halves), halves, weights)}
     on = _agreement(smoothed, halves, weights)
@@ -232,9 +235,7 @@ def calibrate(
             curve[k] = _agreement(blended, halves, weights)
         whole, visible = effective(half_views.sum(0), alike) * reliability, half_views.any(0)
         least = max(LEAST, LEAST_SHARE * float(whole[visible].mean())) * alike / ALIKE
-        strength = max(
-            (k for k in STRENGTHS if k >= least), key=lambda k: (curve[k], -k), default=0.0
-        )
+        strength = max((k for k in curve if k >= least), key=lambda k: (curve[k], -k))
     return Calibration(on > curve[0.0], strength, {"off": curve, "on": {0.0: on}})
 
 

@@ -17,7 +17,7 @@ SHIPPED_WORTH = 3.0  # scenes that what ships counts for
 RIDGE = 1e-2  # in units of the diagonal of A
 LEAST_VIEWS = 2  # that a point to learn from was seen in
 ENERGY = 0.99  # of what was learned, that the basis holds
-LEAST_SHARE = 1e-3  # of the weight of all points, that those of a class need for a mean
+LEAST_OF_CLASS = 1e-3  # of the weight of all points, that those of a class need for a mean
 ZERO = 1e-12  # of the largest of diag A, up to which a feature counts as zero everywhere
 KAPPA = 0.1  # of ρ′ = ρ (1 + κ σ_f)
 
@@ -102,8 +102,8 @@ def solved(sums: Sums, ridge: float) -> np.ndarray:
 
 
 def class_means(sums: Sums, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean features z of the points of each class, f64 [K, p], and the classes that have points,
-    i64 [K], in order.
+    """Mean features z of the points of each class, f64 [K, p], and which classes these are, i64
+    [K], in order: those of LEAST_OF_CLASS of the weight.
 
     Args: sums: of points whose y ends in their class's embedding; embeddings [L, d]: of L <= d
       classes, linearly independent.
@@ -111,7 +111,7 @@ def class_means(sums: Sums, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndar
       pseudo-inverse takes apart; z ends in 1, so its last row is each class's share of the weight.
     """
     by_class = sums.cross[:, -embeddings.shape[1] :] @ np.linalg.pinv(embeddings.astype(np.float64))
-    present = np.flatnonzero(by_class[-1] >= LEAST_SHARE)
+    present = np.flatnonzero(by_class[-1] >= LEAST_OF_CLASS)
     return (by_class[:, present] / by_class[-1, present]).T, present
 
 

@@ -75,11 +75,12 @@ def into_channels(
 
 def confused_with(path: Path, knowledge: Knowledge, features: Features) -> np.ndarray:
     """For each of a scene's labels the label that shape mostly gives to things of it, i64 [L]: its
-    own, where shape tells it or was not taught it.
+    own, where shape tells it or was taught no class of that name.
 
     Args: knowledge: read from `path`.
     Raises: as `into_channels`.
-    Choices: what shape mostly gives is the answer at the class's mean: a keyboard's is a desk.
+    Choices: what shape mostly gives is the answer at the class's mean: a keyboard's is a desk. Of
+      two labels of one class (table and dining table) it gives one to both.
     """
     rows = np.array(match_names(features.label_names, knowledge.classes), np.int64)
     own = np.arange(len(rows))

@@ -112,7 +112,7 @@ for step in range(10, 100_000, 10):
 
 
 def opensplat_standin(folder):
-    """A program that is called and ends as OpenSplat, and trains nothing."""
+    """A program that is called and prints as OpenSplat, and trains nothing."""
     path = folder / "opensplat"
     path.write_text(f"#!{sys.executable}{STANDIN}")
     path.chmod(0o755)

@@ -202,6 +202,9 @@ def test_shape_has_no_vote_where_views_tell_what_it_takes_for_the_same():
     blind = Shape(answers, labels, np.array([0, 0, 2]))  # a keyboard is a desk to it
     np.testing.assert_array_equal(blind.beside(seen).any(1), [True, False, True, True, False])
     np.testing.assert_array_equal(Shape(answers, labels, np.arange(3)).beside(seen), answers)
+    desks = Shape(answers, labels, np.array([1, 1, 2]))  # a desk is a keyboard to it
+    given = Shape(np.tile(keyboard, (2, 1)), labels, desks.confused_with)
+    np.testing.assert_array_equal(given.beside(np.stack([desk, 0 * desk])).any(1), [False, True])
 
 
 def test_what_is_refined_lies_midway_between_trained_and_lifted_and_is_as_long_as_the_trained():
