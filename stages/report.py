@@ -335,7 +335,7 @@ def refined_rows(facts: dict[str, Any] | None) -> list[Figure]:
         for name in ("smoothing", "knowledge")
         if (share := facts.get(f"changed_by_{name}")) is not None
     ]
-    half = "agreement of half the training views with the other, smoothing"
+    half = "agreement of half the training views with the other, labels alike, smoothing"
     return rows + [
         Figure(f"{half} {name}, at k =", curve, form="{:.4f}")
         for name, curve in facts["curve"].items()

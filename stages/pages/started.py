@@ -51,7 +51,7 @@ def worth(refined: dict[str, Any]) -> list[tuple[str, str]]:
     strength = f"{refined['strength'] / belief:g}" if belief else "0"
     if strength not in curve or strength == "0":
         return [("worth on training views held out", "not told: it counts for nothing here")]
-    agreed = f"agreement {curve['0']:.4f} without it, {curve[strength]:.4f} with it"
+    agreed = f"agreement, labels alike, {curve['0']:.4f} without it, {curve[strength]:.4f} with it"
     views = "1 view" if strength == "1" else f"{strength} views"
     views += (
         "" if belief == 1 else (f", of which {belief:.0%} is believed: the teacher says otherwise")
