@@ -39,8 +39,7 @@ REACH = 0.15  # metres from swept points, where an answer is half as long
 
 
 def run(job: Job) -> None:
-    """Blend knowledge into the features of trained Gaussians, and smooth (docs/method.md, section
-    13).
+    """Blend knowledge into features of Gaussians, and smooth (docs/method.md, section 13).
 
     Reads `gaussians` and `lifted`; for the scene's unit `capture`; for knowledge `knowledge`,
     `descriptors`, `encoding` and `features`, by which the share of labels that change is counted,
