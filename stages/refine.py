@@ -57,8 +57,8 @@ def run(job: Job) -> None:
             f"{job.inputs['lifted']} is of {len(lifted.features)} Gaussians, not "
             f"{len(p['means'])}; lift again"
         )
-    taught = Features.read(job.inputs["features"]) if "features" in job.inputs else None
-    if taught is not None and taught.label_embeddings.shape[1] != lifted.features.shape[1]:
+    teacher = Features.read(job.inputs["features"]) if "features" in job.inputs else None
+    if teacher is not None and teacher.label_embeddings.shape[1] != lifted.features.shape[1]:
         raise InputError(
             f"{job.inputs['features']} has other channels than the checkpoint; pass its own"
         )
@@ -115,11 +115,11 @@ def run(job: Job) -> None:
     Refined(refined, sure, notes).write(job.out)
     before, after = (halves_agree(lifted.halves, lifted.half_views, of) for of in (None, halves))
     job.facts |= {"halves_agree": after, "gain": after - before}
-    if capture is not None and taught is not None:
-        job.facts["right"] = labels_right(capture, p, refined, taught)
+    if capture is not None and teacher is not None:
+        job.facts["right"] = labels_right(capture, p, refined, teacher)
     job.facts |= {"n_gaussians": len(features), "unit": unit, **notes}
-    if taught is not None:
-        job.facts |= changed_by([features, alone, refined], taught.label_embeddings)
+    if teacher is not None:
+        job.facts |= changed_by([features, alone, refined], teacher.label_embeddings)
 
 
 def predict_from_shape(job: Job, parameters: dict[str, np.ndarray], unit: float) -> Shape | None:
@@ -162,8 +162,8 @@ def predict_from_shape(job: Job, parameters: dict[str, np.ndarray], unit: float)
     )
     if descriptors.notes["of"] == "swept depth":
         carried *= 1 / (1 + (away[:, None] / unit / REACH) ** 2)
-    names, taken = features.label_names, confused_with(path, knowledge, features)
-    confused = {names[k]: names[to] for k, to in enumerate(taken) if to != k}
+    names, confusions = features.label_names, confused_with(path, knowledge, features)
+    confused = {names[k]: names[to] for k, to in enumerate(confusions) if to != k}
     if confused:
         pairs = ", ".join(f"{name} for {other}" for name, other in confused.items())
         job.left_out("votes of shape against some labels", f"knowledge takes {pairs}")
@@ -173,7 +173,7 @@ def predict_from_shape(job: Job, parameters: dict[str, np.ndarray], unit: float)
         "lessons": knowledge.lessons,
         "confused": confused,
     }
-    return Shape(carried, features.label_embeddings, taken)
+    return Shape(carried, features.label_embeddings, confusions)
 
 
 def changed_by(steps: list[np.ndarray], embeddings: np.ndarray) -> dict[str, float]:

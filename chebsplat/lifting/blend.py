@@ -24,7 +24,7 @@ LEAST_SHARE = 0.5  # strength, in mean evidence of a Gaussian that is seen
 
 
 class Shape(NamedTuple):
-    """What knowledge of shape answers for N Gaussians.
+    """Answers of knowledge of shape for N Gaussians.
 
     answers:       g, f32 [N, C], the surer the longer.
     embeddings:    [L, C] of the scene's labels.
@@ -39,8 +39,9 @@ class Shape(NamedTuple):
         """Answers that count beside features of views [N, C], zero where unseen: none where shape
         gives the label that it mostly gives to things of the label that the views give.
         """
-        seen, given = (decode_labels(of, self.embeddings) for of in (features, self.answers))
-        blind = (self.confused_with[seen] == given) & (seen != given) & features.any(1)
+        by_views, by_shape = (decode_labels(of, self.embeddings) for of in (features, self.answers))
+        blind = (self.confused_with[by_views] == by_shape) & (by_views != by_shape)
+        blind &= features.any(1)
         return np.where(blind[:, None], 0, self.answers).astype(np.float32)
 
 
@@ -185,11 +186,9 @@ def halves_agree(
     return _agreement(list(halves) if refined is None else refined, halves, weights)
 
 
-def _agreement(made: Sequence[np.ndarray], halves: np.ndarray, weights: np.ndarray) -> float:
-    """Mean cosine of what is made of each half and the other half, weighted by the other's
-    [2, N].
-    """
-    both = sum(float(weights[1 - own] @ cosines(made[own], halves[1 - own])) for own in (0, 1))
+def _agreement(predicted: Sequence[np.ndarray], halves: np.ndarray, weights: np.ndarray) -> float:
+    """Mean cosine of what each half predicts and the other half, weighted by the other's [2, N]."""
+    both = sum(float(weights[1 - own] @ cosines(predicted[own], halves[1 - own])) for own in (0, 1))
     return both / max(float(weights.sum()), 1e-30)
 
 
@@ -220,9 +219,9 @@ def calibrate(
     reliability = reliable(halves, half_views)
     weights = np.where((half_views > 0).all(0), half_views, 0).astype(np.float64)
     if shape is not None:
-        seen = decode_labels((half_views[..., None] * halves).sum(0), shape.embeddings)
-        of_label = np.bincount(seen, weights.sum(0))
-        weights /= np.maximum(of_label, max(LEAST_OF_LABEL * of_label.sum(), 1))[seen]
+        labels = decode_labels((half_views[..., None] * halves).sum(0), shape.embeddings)
+        of_label = np.bincount(labels, weights.sum(0))
+        weights /= np.maximum(of_label, max(LEAST_OF_LABEL * of_label.sum(), 1))[labels]
     smoothed = [smooth(*of, near) for of in zip(halves, half_views, strict=True)]
     curve = {0.0: _agreement(list(halves), halves, weights)}
     on = _agreement(smoothed, halves, weights)

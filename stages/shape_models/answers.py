@@ -87,8 +87,8 @@ def confused_with(path: Path, knowledge: Knowledge, features: Features) -> np.nd
     if (rows < 0).all():
         return own
     answers = into_channels(path, knowledge, features)(knowledge.class_means @ knowledge.map)
-    given = decode_labels(answers, features.label_embeddings)
-    return np.where(rows >= 0, given[rows], own)
+    labels = decode_labels(answers, features.label_embeddings)
+    return np.where(rows >= 0, labels[rows], own)
 
 
 def into_meanings(
