@@ -1,4 +1,4 @@
-"""`knowledge/3`: an encoder of shape, and the map from its features to meaning."""
+"""`knowledge/4`: an encoder of shape, and the map from its features to meaning."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from chebsplat.formats.lesson import SPECS as SUMS
 from chebsplat.formats.lesson import PlainSums, packed, unpacked
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
-SCHEMA = "chebsplat.knowledge/3"
+SCHEMA = "chebsplat.knowledge/4"
 # of the embedded teacher; ships with the package
 SHIPPED = Path(__file__).parents[1] / "teachers/knowledge"
 SPECS: dict[str, Spec] = {"matrix": ("float32", "C", "d"), "embeddings": ("float16", "W", "d"),
-                          "map": ("float32", "p", "2 d"), "basis": ("float32", "p", "r"),
+                          "map": ("float32", "p", "d"), "basis": ("float32", "p", "r"),
                           "scale": ("float32", "p"),
                           "class_means": ("float32", "K", "p")}  # fmt: skip
 
@@ -31,8 +31,8 @@ class Knowledge:
     encoder:    constructor settings of the point encoder; weights: its arrays by name.
     matrix:     f32 [C, d], from the teacher's C channels to d; columns orthonormal.
     describe:   settings of the descriptors that the encoder reads.
-    words:      W words of the vocabulary; embeddings f16 [W, d], unit in the teacher's channels.
-    map:        f32 [p, 2 d], from features of shape to d of the teacher's channels and d of words.
+    words:      W words of the vocabulary; embeddings f16 [W, d], unit.
+    map:        f32 [p, d], from features of shape to the embeddings of words.
     basis:      f32 [p, r], of features times scale f32 [p]: the subspace learned so far (Eq 15).
     classes:    K classes that it was taught; class_means f32 [K, p], the mean features of shape of
       each, by which the classes are found that shape does not tell apart.

@@ -1,4 +1,4 @@
-"""`lesson/1`: normal-equation sums over one scene's points, and evidence for their trust."""
+"""`lesson/2`: normal-equation sums over one scene's points, and evidence for their trust."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from chebsplat.formats import artifact
 from chebsplat.formats.artifact import read_document, write_document
 from chebsplat.formats.tensors import Spec, read_tensors, write_tensors
 
-SCHEMA = "chebsplat.lesson/1"
-# `shape.lessons.Sums`, which formats do not import: A f64 [p, p], b f64 [p, 2 d] and c
+SCHEMA = "chebsplat.lesson/2"
+# `shape.lessons.Sums`, which formats do not import: A f64 [p, p], b f64 [p, d] and c
 PlainSums = tuple[np.ndarray, np.ndarray, float]
-SPECS: dict[str, Spec] = {"gram": ("float32", "half"), "cross": ("float32", "p", "2 d")}
+SPECS: dict[str, Spec] = {"gram": ("float32", "half"), "cross": ("float32", "p", "d")}
 
 
 @dataclass

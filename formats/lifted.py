@@ -43,8 +43,8 @@ class Refined(Record):
     features:   f32 [N, C].
     confidence: f32 [N] in [0, 1], from the number and agreement of votes; 0 without votes.
     notes:      initial features, smoothing, weight of knowledge in views, weight of a view where
-      the teacher is unsure of the scene, and the agreement of the two halves of the training views
-      by which smoothing and strength were chosen.
+      the teacher is unsure of the scene, and labels that the two halves of the training views have
+      alike without and with knowledge.
     """
 
     SCHEMA: ClassVar[str] = "chebsplat.refined/2"

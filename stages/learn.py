@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -22,21 +22,39 @@ from chebsplat.formats.points import Points
 from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.lifting.averages import SEEN_WITHIN, SWEPT_WITHIN, averaged
-from chebsplat.lifting.blend import familiar
-from chebsplat.shape.lessons import LEAST_VIEWS, Sums, novelty, odds, scaled_novelty, summed
+from chebsplat.lifting.blend import (
+    Shape,
+    believed,
+    blend,
+    effective,
+    errors_alike,
+    familiar,
+    lengths,
+    strength_of,
+    supported,
+)
+from chebsplat.lifting.observations import halves_of
+from chebsplat.shape.lessons import (
+    LEAST_VIEWS,
+    Sums,
+    novelty,
+    odds,
+    scaled_novelty,
+    summed,
+    unexplained,
+)
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.shape_models.answers import (
-    into_meanings,
-    of_features,
-    to_knowledge,
+    answering,
+    into_channels,
     units,
     unnamed,
     words_by_label,
-    words_of,
 )
 from chebsplat.stages.shape_models.surfaces import in_scene, swept_Ks
 from chebsplat.stages.teacher_models.text_encoder import match_names
 
+SHAPE_WORTH = 16.0  # times what shape counts for in `refine`, where labels are decided
 REACH = 0.3  # metres from a label to the described point that it is of
 KIND = {"depth": "held_out", "swept depth": "held_out_swept"}  # of rooms, by kind of surface
 # times the largest novelty of such rooms, held out: a scene above it is new in kind
@@ -50,12 +68,15 @@ def run(job: Job) -> None:
     Reads `capture`, `points`, `descriptors`, `encoding`, `features`, and the `knowledge` that
     ships, against which it is judged. Writes `lesson`. It is empty where a scene shows too little
     of a surface.
-    Choices: trust is measured against what ships, not against what earlier lessons have made of
-      it: so it does not depend on the order in which scenes are learned.
+    Choices: labels are decided, and trust is measured, with what ships, not with what earlier
+      lessons have made of it: so neither depends on the order in which scenes are learned.
     """
     settings, start = job.config.learn, read_knowledge(job.inputs["start"])
     capture = Capture.read(job.inputs["capture"])
-    points, features = Points.read(job.inputs["points"]), Features.read(job.inputs["features"])
+    features, encoding = (
+        Features.read(job.inputs["features"]),
+        Encoding.read(job.inputs["encoding"]),
+    )
     descriptors = Descriptors.read(job.inputs["descriptors"])
     notes = {
         "scene": job.config.scene.name,
@@ -64,25 +85,19 @@ def run(job: Job) -> None:
         "given": features.convention["kind"] in VOUCHED,
         "unnamed": [],
     }
-    encoding = Encoding.read(job.inputs["encoding"])
     z = encoding.features.astype(np.float32)
     try:
         if not len(z):
             raise DataFailure(encoding.notes["none"])
         if settings.points is not None:
             world = World.read(capture.source)
-            meanings, n_views, embeddings = labelled(
-                Path(settings.points), start, descriptors, world
-            )
+            taught = by_points(Path(settings.points), start, descriptors, world, z)
             notes |= {"given": True, "teacher": "labelled points"}
         else:
-            meanings, n_views = average_views(job, start, capture, points, features, descriptors)
-            embeddings = named_embeddings(job, start, features)
+            points = Points.read(job.inputs["points"])
+            taught = by_views(job.inputs["start"], start, capture, points, features, descriptors, z)
             notes["unnamed"] = unnamed(start, features)
-        labels = decode_labels(meanings, embeddings)
-        weights = odds(n_views, labels)
-        in_channels = settings.points is None and of_features(features)
-        words = words_by_label(start, features)[labels] if in_channels else meanings
+        weights = odds(taught.n_views, taught.labels)
     except DataFailure as error:
         job.left_out("a lesson", str(error))
         p, d = start.map.shape
@@ -92,88 +107,152 @@ def run(job: Job) -> None:
     if notes["unnamed"]:
         job.left_out(
             "labels without a word",
-            f"knowledge has no word for {', '.join(notes['unnamed'])}: no vote from shape",
+            f"knowledge has no word for {', '.join(notes['unnamed'])}: not learned, and no vote "
+            "from shape",
         )
-    sums = summed(z, np.concatenate([meanings, words], 1), weights)
-    visible, half = n_views >= LEAST_VIEWS, meanings.shape[1]
-    answers = z @ (start.map[:, :half] if in_channels else start.map[:, half:])
-    missed = (
-        weights
-        @ np.square(answers - meanings).sum(1)
-        / max(float(weights @ np.square(meanings).sum(1)), 1e-30)
-    )
+    sums = summed(z, taught.words, weights)
     rho, spread = novelty(sums, start.scale, start.basis), sums.spread()
     notes |= {
-        "n_points": int(visible.sum()),
-        "n_labels": len(embeddings),
+        "n_points": int((taught.n_views >= LEAST_VIEWS).sum()),
+        "n_labels": len(np.unique(taught.labels[weights > 0])),
         "rho": rho,
         "sigma": spread,
         "novelty": scaled_novelty(rho, spread),
         "known": KNOWN * start.card["novelty"][KIND[descriptors.notes["of"]]],
-        "familiar": familiar(meanings[visible], answers[visible], embeddings),
-        "alike": float((decode_labels(answers[visible], embeddings) == labels[visible]).mean()),
+        "familiar": taught.familiar,
+        "alike": taught.alike,
     }
-    job.facts |= notes | {"unexplained": float(missed)}
+    job.facts |= notes | {"unexplained": unexplained(sums, start.map.astype(np.float64))}
     write_lesson(job.out, Lesson(sums, notes))
 
 
-def average_views(
-    job: Job,
+class Taught(NamedTuple):
+    """Labels of the N described points of a scene, as its lesson teaches them.
+
+    labels:   int [N], index of a label; n_views: i64 [N], that a point is seen in, 0: not to learn.
+    words:    f32 [N, d], unit embedding of each label's word, zero of labels without one.
+    familiar: of `blend.familiar`; alike: share of labels that shape and teacher have alike.
+    """
+
+    labels: np.ndarray
+    n_views: np.ndarray
+    words: np.ndarray
+    familiar: float
+    alike: float
+
+
+def by_views(
+    path: Path,
     start: Knowledge,
     capture: Capture,
     points: Points,
     features: Features,
     descriptors: Descriptors,
+    z: np.ndarray,
+) -> Taught:
+    """Labels that the training views' mean features and shape decide together.
+
+    Args: path: of the knowledge start; z [N, p], features of shape of the described points.
+    Raises: DataFailure where no training view has a camera and features, or knowledge has no word
+      for any label.
+    Choices: labels, not the teacher's mean features, which hold what it confuses.
+    """
+    answers = into_channels(path, start, features)(z @ start.map)
+    shape = answering(path, start, features, answers)
+    halves, half_views = average_halves(capture, points, features, descriptors)
+    means, labels, worth = decide_labels(halves, half_views, shape)
+    n_views, words = half_views.sum(0), words_by_label(path, start, features)
+    named = np.asarray(words.any(1))
+    by_teacher, by_shape = (decode_labels(of, shape.embeddings) for of in (means, answers))
+    n_views = np.where(named[labels] & named[by_teacher], n_views, 0)
+    judged = n_views >= LEAST_VIEWS
+    return Taught(
+        labels,
+        n_views,
+        words[labels],
+        worth,
+        float((by_teacher == by_shape)[judged].mean()) if judged.any() else 0.0,
+    )
+
+
+def decide_labels(
+    halves: np.ndarray, half_views: np.ndarray, shape: Shape
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Mean features of N points over all views, f32 [N, C]; the label of each that these and shape
+    decide, int [N]; and `familiar` of them.
+
+    Args: halves [2, N, C], mean features over each half of the views; half_views [2, N] how many
+      of them see each; shape: of the N points.
+    Choices: errors that most views share would be taught to shape, which could then no longer
+      correct them. Points are not smoothed, so that shape counts for SHAPE_WORTH times what it
+      counts for in `refine`; where many views err independently, they outvote it all the same.
+    """
+    n_views = half_views.sum(0)
+    total = (half_views[..., None] * halves).sum(0)
+    means = (total / np.maximum(n_views, 1)[:, None]).astype(np.float32)
+    worth = familiar(means, shape.answers, shape.embeddings)
+    agreement = lengths(means)
+    support = supported(means, n_views, agreement, shape)
+    strength = SHAPE_WORTH * strength_of(support, worth, believed(means, n_views, shape, worth))
+    evidence = effective(n_views, errors_alike(agreement, halves, half_views))
+    decided = blend(means, evidence, shape.beside(means), strength)
+    return means, decode_labels(decided, shape.embeddings), worth
+
+
+def average_halves(
+    capture: Capture, points: Points, features: Features, descriptors: Descriptors
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean features of the described points over training views, f64 [N, d]; numbers of views [N].
+    """Mean unit features of the described points over each half of the training views, f32 [2, N,
+    C], and how many of these see each, i64 [2, N].
 
     Raises: DataFailure where no training view has a camera and features.
     """
     row = {name: view for view, name in enumerate(capture.names)}
     place = {name: view for view, name in enumerate(features.names)}
-    used = [
-        k for k, name in enumerate(points.names) if not capture.is_test[row[name]] and name in place
-    ]
-    if not used:
-        raise DataFailure("no training view has a camera and features")
-    Ks, within = points.Ks[used], SEEN_WITHIN
-    depth: Iterable[np.ndarray]
-    if capture.depth is not None:
-        depth = (capture.depth[row[points.names[k]]] for k in used)
-    else:
-        assert points.depths is not None
-        depth, within = points.depths[used], SWEPT_WITHIN
-        Ks = swept_Ks(points, capture.size[0])[used]
-    meaning = into_meanings(job.inputs["start"], start, features)
-    views = (meaning(place[points.names[k]]) for k in used)
-    means, _ = in_scene(descriptors)
-    return averaged(
-        means,
-        depth,
-        views,
-        start.matrix.shape[1],
-        Ks,
-        points.cam_from_world[used],
-        within,
-        descriptors.unit,
+    used = np.array(
+        [
+            k
+            for k, name in enumerate(points.names)
+            if not capture.is_test[row[name]] and name in place
+        ],
+        np.int64,
     )
+    if not len(used):
+        raise DataFailure("no training view has a camera and features")
+    means, _ = in_scene(descriptors)
+    depth, Ks, within = capture.depth, points.Ks, SEEN_WITHIN
+    if depth is None:
+        Ks, within = swept_Ks(points, capture.size[0]), SWEPT_WITHIN
+
+    def depth_of(k: int) -> np.ndarray:
+        """Depth of the view that is number k of the points' names."""
+        of = points.depths[k] if depth is None else depth[row[points.names[k]]]  # type: ignore[index]
+        return np.asarray(of)
+
+    def average(views: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean features over some of the views, and numbers of them."""
+        return averaged(
+            means,
+            map(depth_of, views),
+            (features.features[place[points.names[k]]] for k in views),
+            features.features.shape[-1],
+            Ks[views],
+            points.cam_from_world[views],
+            within,
+            descriptors.unit,
+        )
+
+    half_of = halves_of(len(used))
+    halves, half_views = zip(*(average(used[half_of == half]) for half in (0, 1)), strict=True)
+    return np.stack(halves).astype(np.float32), np.stack(half_views)
 
 
-def named_embeddings(job: Job, start: Knowledge, features: Features) -> np.ndarray:
-    """Embeddings f32 [L, d] of the scene's labels in the channels of knowledge; where the scene has
-    codes of classes, of those that knowledge has a word for.
-    """
-    if not of_features(features):
-        return words_of(job.inputs["start"], start, features)[1]
-    return np.asarray(features.label_embeddings @ to_knowledge(start, features))
+def by_points(
+    path: Path, start: Knowledge, descriptors: Descriptors, world: World, z: np.ndarray
+) -> Taught:
+    """A user's words for points, as LEAST_VIEWS views of the described points beside them.
 
-
-def labelled(
-    path: Path, start: Knowledge, descriptors: Descriptors, world: World
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A user's words for points: embeddings f32 [N, d] of the described points, zero without word;
-    n_views [N], LEAST_VIEWS of those with one; and the unit embeddings f32 [L, d] of the words.
-
+    Args: z [N, p], features of shape of the described points.
     Raises: InputError naming the line that is no point, the word that knowledge lacks, or that
       nothing lies beside.
     Choices: a label is of the described point nearest to it, within REACH.
@@ -194,10 +273,18 @@ def labelled(
             f"{path}: no point lies within {REACH} m of the scene's surface; give x, "
             "y, z in its frame"
         )
-    meanings = np.zeros((len(means), start.matrix.shape[1]), np.float32)
-    embeddings = units(start.embeddings[rows])
-    np.add.at(meanings, nearest[beside], embeddings[beside])
-    return units(meanings), np.where(meanings.any(1), LEAST_VIEWS, 0), np.unique(embeddings, axis=0)
+    embeddings, label = np.unique(units(start.embeddings[rows]), axis=0, return_inverse=True)
+    votes = np.zeros((len(means), len(embeddings)), np.int64)
+    np.add.at(votes, (nearest[beside], label[beside]), 1)
+    labels, visible = votes.argmax(1), votes.any(1)
+    meanings, answers = embeddings[labels], z @ start.map
+    return Taught(
+        labels,
+        np.where(visible, LEAST_VIEWS, 0),
+        meanings,
+        familiar(meanings[visible], answers[visible], embeddings),
+        float((decode_labels(answers, embeddings) == labels)[visible].mean()),
+    )
 
 
 def read_labels(path: Path) -> tuple[np.ndarray, list[str]]:

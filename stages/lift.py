@@ -5,7 +5,7 @@ from __future__ import annotations
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
-from chebsplat.lifting.blend import halves_agree
+from chebsplat.lifting.blend import labels_agree
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.training.lifting import lifted_from
 from chebsplat.stages.training.truth import labels_right
@@ -33,7 +33,7 @@ def run(job: Job) -> None:
         "n_unseen": int((lifted.n_views == 0).sum()),
         "n_observations": lifted.notes["n_observations"],
         "n_views": len(lifted.notes["views"]),
-        "halves_agree": halves_agree(lifted.halves, lifted.half_views),
+        "labels_agree": labels_agree(lifted.halves, lifted.half_views, features.label_embeddings),
         "right": labels_right(capture, gaussians.parameters, lifted.features, features),
     }
     lifted.write(job.out)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from chebsplat.errors import ConfigError, DataFailure, InputError
@@ -17,21 +19,23 @@ from chebsplat.lifting.blend import (
     Shape,
     believed,
     blend,
-    calibrate,
     confidence,
     effective,
     errors_alike,
     familiar,
     halves_agree,
+    labels_agree,
     reliable,
     start,
+    strength_of,
+    supported,
     trusted,
 )
 from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import affinities, smooth
 from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages.runtime.command import Job
-from chebsplat.stages.shape_models.answers import confused_with, into_channels, unnamed
+from chebsplat.stages.shape_models.answers import answering, into_channels, unnamed
 from chebsplat.stages.shape_models.surfaces import in_scene, scene_unit
 from chebsplat.stages.training.truth import labels_right
 
@@ -79,18 +83,22 @@ def run(job: Job) -> None:
     near = affinities(p["means"], *surface_of(p), unit)
     shape = predict_from_shape(job, p, unit)
     alike = errors_alike(lifted.agreement, lifted.halves, lifted.half_views)
-    choice = calibrate(lifted.halves, lifted.half_views, near, shape, alike)
-    smoothed = choice.smooth if settings.smooth == "auto" else settings.smooth == "on"
-    strength = choice.strength
-    known_to_teacher = belief = 1.0
-    knowledge = None
+    each = list(zip(lifted.halves, lifted.half_views, strict=True))
+    smoothed_halves = [smooth(*half, near) for half in each]
+    as_they_are, smoother = (
+        halves_agree(lifted.halves, lifted.half_views, of) for of in (None, smoothed_halves)
+    )
+    smoothed = smoother > as_they_are if settings.smooth == "auto" else settings.smooth == "on"
+    notes: dict[str, Any] = {"start": started, "smooth": smoothed, "strength": 0.0, "alike": alike}
+    strength, known_to_teacher, knowledge = 0.0, 1.0, None
     if shape is not None:
         known_to_teacher = familiar(lifted.features, shape.answers, shape.embeddings)
-        belief = believed(
-            lifted.features, lifted.n_views, shape.answers, shape.embeddings, known_to_teacher
-        )
-        strength *= belief
+        support = supported(lifted.features, lifted.n_views, lifted.agreement, shape)
+        belief = believed(lifted.features, lifted.n_views, shape, known_to_teacher)
+        strength = strength_of(support, known_to_teacher, belief)
+        notes |= {"strength": strength, "supported": support, "believed": belief}
         knowledge = shape.beside(features)
+    notes["familiar"] = known_to_teacher
     reliability = reliable(lifted.halves, lifted.half_views) * known_to_teacher
 
     def refine(of: np.ndarray, n_views: np.ndarray) -> np.ndarray:
@@ -103,18 +111,20 @@ def run(job: Job) -> None:
 
     alone = smooth(features, lifted.n_views, near) if smoothed else features
     refined = refine(features, lifted.n_views)
-    halves = [refine(*of) for of in zip(lifted.halves, lifted.half_views, strict=True)]
-    curve = {
-        name: {f"{k:g}": value for k, value in row.items()} for name, row in choice.curve.items()
-    }
-    notes = {"start": started, "smooth": smoothed, "strength": strength, "curve": curve}
-    notes |= {"familiar": known_to_teacher, "believed": belief, "alike": alike}
+    halves = [refine(*half) for half in each]
     sure = confidence(
         alone, lifted.n_views, lifted.agreement, knowledge, strength, known_to_teacher, alike
     )
+    if teacher is not None:
+        agreed, without, after = (
+            labels_agree(lifted.halves, lifted.half_views, teacher.label_embeddings, of)
+            for of in (None, smoothed_halves if smoothed else None, halves)
+        )
+        if agreed is not None and after is not None:
+            job.facts |= {"labels_agree": after, "gain": after - agreed}
+            if strength > 0:
+                notes["halves"] = {"without": without, "with": after}
     Refined(refined, sure, notes).write(job.out)
-    before, after = (halves_agree(lifted.halves, lifted.half_views, of) for of in (None, halves))
-    job.facts |= {"halves_agree": after, "gain": after - before}
     if capture is not None and teacher is not None:
         job.facts["right"] = labels_right(capture, p, refined, teacher)
     job.facts |= {"n_gaussians": len(features), "unit": unit, **notes}
@@ -162,7 +172,8 @@ def predict_from_shape(job: Job, parameters: dict[str, np.ndarray], unit: float)
     )
     if descriptors.notes["of"] == "swept depth":
         carried *= 1 / (1 + (away[:, None] / unit / REACH) ** 2)
-    names, confusions = features.label_names, confused_with(path, knowledge, features)
+    shape = answering(path, knowledge, features, carried)
+    names, confusions = features.label_names, shape.confused_with
     confused = {names[k]: names[to] for k, to in enumerate(confusions) if to != k}
     if confused:
         pairs = ", ".join(f"{name} for {other}" for name, other in confused.items())
@@ -173,7 +184,7 @@ def predict_from_shape(job: Job, parameters: dict[str, np.ndarray], unit: float)
         "lessons": knowledge.lessons,
         "confused": confused,
     }
-    return Shape(carried, features.label_embeddings, confusions)
+    return shape
 
 
 def changed_by(steps: list[np.ndarray], embeddings: np.ndarray) -> dict[str, float]:

@@ -107,7 +107,7 @@ STAGES: dict[str, Stage] = {
               seconds=lambda k: 0.6, mem_mb=2000,  # 1, 3; 121 MB
               help="How far views agree on what the same points are: whether the teacher knows "
                    "the scene."),
-        Stage("teach", "chebsplat.knowledge/3", ("teach",), (("channels", "channels"),),
+        Stage("teach", "chebsplat.knowledge/4", ("teach",), (("channels", "channels"),),
               of_scene=False, minutes=600, mem_mb=8000,  # 3142
               help="The encoder of shape that scenes start from, taught over generated rooms."),
         Stage("describe", "chebsplat.descriptors/2", ("describe",),
@@ -120,16 +120,16 @@ STAGES: dict[str, Stage] = {
               seconds=lambda k: 1.6, megabytes=lambda k: 24,
               help="Features of the shape about each point, by the knowledge's transformers "
                    "(Eq 7)."),
-        Stage("learn", "chebsplat.lesson/1", ("scene", "learn"),
+        Stage("learn", "chebsplat.lesson/2", ("scene", "learn"),
               (("capture", "ingest"), ("points", "sfm"), ("descriptors", "describe"),
                ("encoding", "encode"), ("features", "teacher"), ("start", "teach")),
               seconds=lambda k: 0.8,
               help="What the scene teaches about shape, for the scenes after it."),
-        Stage("recall", "chebsplat.knowledge/3", (), (("start", "teach"),), (("lesson", "learn"),),
+        Stage("recall", "chebsplat.knowledge/4", (), (("start", "teach"),), (("lesson", "learn"),),
               seconds=lambda k: 0.5,
               help="What the scene starts from: what ships, and the lessons that it is pinned to "
                    "(Eqs 14-15)."),
-        Stage("onnx", "chebsplat.encoder/3", (),
+        Stage("onnx", "chebsplat.encoder/4", (),
               (("knowledge", "recall"), ("descriptors", "describe")),
               seconds=lambda k: 0.6,
               help="The encoder of shape and the scene's knowledge as one ONNX graph, compared "

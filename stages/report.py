@@ -319,7 +319,7 @@ def taken_rows(figures: dict[str, Any] | None) -> list[Figure]:
 
 
 def refined_rows(facts: dict[str, Any] | None) -> list[Figure]:
-    """Refined features: the choices, and the agreements behind them."""
+    """Refined features: the choices, and labels that halves of the views reproduce."""
     if facts is None:
         return []
     counts = f"counts as {facts['strength']:g} views" if facts["strength"] else "none"
@@ -335,10 +335,10 @@ def refined_rows(facts: dict[str, Any] | None) -> list[Figure]:
         for name in ("smoothing", "knowledge")
         if (share := facts.get(f"changed_by_{name}")) is not None
     ]
-    half = "agreement of half the training views with the other, labels alike, smoothing"
+    half = "labels of half the training views that the other half reproduces, %"
     return rows + [
-        Figure(f"{half} {name}, at k =", curve, form="{:.4f}")
-        for name, curve in facts["curve"].items()
+        Figure(f"{half}, {name} knowledge", percent(share), form="{:.1f}")
+        for name, share in facts.get("halves", {}).items()
     ]
 
 

@@ -108,9 +108,7 @@ def run(job: Job) -> None:
             scaled_novelty(novelty(one, scale, shape_basis), one.spread()) for one in sums
         )
         if -1 not in named:
-            card[name] = measure_accuracy(
-                [z @ shape_map[:, : len(classes[0])] for z in encoded], of, classes
-            )
+            card[name] = measure_accuracy([z @ shape_map for z in encoded], of, classes)
     card["novelty"] = newest
     job.facts |= card
     describe = {
@@ -169,14 +167,13 @@ def lesson_of(z: np.ndarray, room: Room, embeddings: np.ndarray) -> Sums:
 
 
 def make_targets(room: Room, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Targets [N, 2 d] of a room's points, the teacher's features beside the unit embedding of the
-    label, and the points' weights [N], sum 1.
+    """Targets [N, d] of a room's points, unit embeddings of the teacher's labels, and the points'
+    weights [N], sum 1.
 
     Args: embeddings [L, d]: of the labels.
     """
     labels = decode_labels(room.features, embeddings)
-    meanings = np.concatenate([room.features, units(embeddings)[labels]], 1)
-    return meanings, odds(room.n_views, labels)
+    return units(embeddings)[labels], odds(room.n_views, labels)
 
 
 def vocabulary(

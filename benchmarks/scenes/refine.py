@@ -22,7 +22,18 @@ from chebsplat.formats.features import Features
 from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.knowledge import SHIPPED, read_knowledge
 from chebsplat.labels.decode import decode_labels
-from chebsplat.lifting.blend import Shape, blend, calibrate, effective, familiar, reliable, trusted
+from chebsplat.lifting.blend import (
+    Shape,
+    believed,
+    blend,
+    effective,
+    errors_alike,
+    familiar,
+    reliable,
+    strength_of,
+    supported,
+    trusted,
+)
 from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import affinities, smooth
 from chebsplat.render import SceneRenderer
@@ -30,7 +41,7 @@ from chebsplat.splats.gaussians import surface_of
 from chebsplat.stages.evaluate import camera
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import LiftSection
-from chebsplat.stages.shape_models.answers import answered, confused_with, inputs_of, into_channels
+from chebsplat.stages.shape_models.answers import answered, answering, inputs_of, into_channels
 from chebsplat.stages.shape_models.surfaces import in_scene
 from chebsplat.stages.training.lifting import lifted_from
 
@@ -122,19 +133,20 @@ def main(arguments: Sequence[str]) -> None:
         answers, _ = carry(
             translated(answered(shipped, inputs)), means, normals, scene.means, scene.surface[0]
         )
-        confused = confused_with(SHIPPED, shipped, scene.taught)
-        return Shape(answers, scene.taught.label_embeddings, confused)
+        return answering(SHIPPED, shipped, scene.taught, answers)
 
     shape, to_know = timed(carry_knowledge)
 
     def blended() -> np.ndarray:
-        choice = calibrate(lifted.halves, lifted.half_views, near, shape)
-        evidence = effective(lifted.n_views) * reliable(lifted.halves, lifted.half_views)
-        evidence = evidence * familiar(lifted.features, shape.answers, shape.embeddings)
+        seen, halves = (lifted.features, lifted.n_views), (lifted.halves, lifted.half_views)
+        worth = familiar(lifted.features, shape.answers, shape.embeddings)
+        evidence = effective(lifted.n_views, errors_alike(lifted.agreement, *halves))
+        evidence = evidence * reliable(*halves) * worth
+        support = supported(*seen, lifted.agreement, shape)
+        strength = strength_of(support, worth, believed(*seen, shape, worth))
         knowledge = shape.beside(scene.features)
-        result = blend(scene.features, evidence, knowledge, choice.strength)
-        votes = evidence + trusted(knowledge, choice.strength)
-        return smooth(result, votes, near) if choice.smooth else result
+        result = blend(scene.features, evidence, knowledge, strength)
+        return smooth(result, evidence + trusted(knowledge, strength), near)
 
     result, to_blend = timed(blended)
     add("and knowledge", to_lift + to_compare + to_know + to_blend, result)

@@ -13,13 +13,12 @@ from chebsplat.lifting.blend import (
     ALIKE,
     SURE,
     blend,
-    calibrate,
     confidence,
     effective,
+    halves_agree,
     reliable,
 )
 from chebsplat.lifting.observations import LEAST_COSINE, N_POINTS, NEAR, carry
-from chebsplat.lifting.smoothing import Affinities
 
 N, C = 30, 4
 TOLERANCE = 1e-5  # float32 results
@@ -126,21 +125,18 @@ def halves(size: float) -> Outcome:
     return beside(ours, lambda: counted(np.float32), counted(np.longdouble), TOLERANCE)
 
 
-@case("a strength is chosen alike for features of {size:.0e}", size=[1e-30, 1e-10, 1e10, 1e30])
-def choose_strength(size: float) -> Outcome:
+@case("halves agree alike for features of {size:.0e}", size=[1e-30, 1e-10, 1e10, 1e30])
+def compare_halves(size: float) -> Outcome:
     """Agreement of the halves as for features of 1, which only directions tell."""
-    rng, near = (
-        np.random.default_rng(0),
-        Affinities(np.zeros((N, 0), np.int32), np.zeros((N, 0), np.float32)),
-    )
+    rng = np.random.default_rng(0)
     both, n = (rng.normal(size=(2, N, C)) + 1).astype(np.float32), np.full((2, N), 3)
 
-    def agreement(dtype: type, size: float) -> list[float]:
-        return list(calibrate((size * both).astype(dtype), n, near).curve["off"].values())
+    def agreement(dtype: type, size: float) -> float:
+        return halves_agree((size * both).astype(dtype), n)
 
-    def plainly() -> list[float]:
+    def plainly() -> float:
         a, b = (np.float32(size) * both).astype(np.float32)
-        return [float(np.mean((a * b).sum(1) / np.sqrt((a * a).sum(1) * (b * b).sum(1))))]
+        return float(np.mean((a * b).sum(1) / np.sqrt((a * a).sum(1) * (b * b).sum(1))))
 
     return beside(agreement(np.float32, size), plainly, agreement(np.float64, 1.0), TOLERANCE)
 

@@ -104,8 +104,7 @@ class Scenes:
         if points is not None:
             rows = np.random.default_rng(scene).choice(len(weights), points, p=weights)
             weights = np.bincount(rows, minlength=len(weights)).astype(np.float64)
-        meanings = np.concatenate([room.features, units(self.classes)[labels]], 1)
-        return summed(self.features[scene], meanings, weights)
+        return summed(self.features[scene], units(self.classes)[labels], weights)
 
     def labelled(self, scene: int, points: int) -> Sums:
         """The lesson of points whose true class a user has said, rare things more often."""
@@ -116,8 +115,7 @@ class Scenes:
             rows, points, replace=False, p=share / share.sum()
         )
         weights = odds(np.full(points, 2), room.labels[rows])
-        words = units(self.classes)[room.labels[rows]]
-        return summed(self.features[scene][rows], np.concatenate([words, words], 1), weights)
+        return summed(self.features[scene][rows], units(self.classes)[room.labels[rows]], weights)
 
     def figures(self, lessons: list[list[Sums]], worth: float) -> dict[str, str]:
         """mIoU of shape alone and of both, each scene by its lessons and `worth` of what ships."""
@@ -125,12 +123,9 @@ class Scenes:
         for z, of in zip(self.features, lessons, strict=True):
             whole = combined([self.shipped, *of], [worth if of else 1.0, *[1.0] * len(of)])
             answers.append(z @ solved(whole, RIDGE).astype(np.float32))
-        half, named = len(self.classes[0]), units(self.classes)
         pairs = list(zip(self.rooms, answers, strict=True))
-        both = [
-            blend(room.features, effective(room.n_views), says[:, :half], K) for room, says in pairs
-        ]
-        shape = scores([says[:, half:] for says in answers], self.rooms, named)
+        both = [blend(room.features, effective(room.n_views), says, K) for room, says in pairs]
+        shape = scores(answers, self.rooms, units(self.classes))
         return {
             "shape": f"{np.mean(shape):.1f}",
             "both": f"{np.mean(scores(both, self.rooms, self.classes)):.1f}",

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from chebsplat.labels.decode import decode, decode_labels
-from chebsplat.lifting.smoothing import Affinities, smooth
 
-STRENGTHS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # views that knowledge may count for
 ALIKE = 0.2  # correlation of the errors of two views of a thing, at most
 SURE = 3  # power of its length by which knowledge counts
 # power by which views count of how far their halves agree, and of how sure they are beside shape
 AGREED = 6
-# An error that a teacher repeats in both halves counts as agreement, however many views there are.
-LEAST = 1.0  # strength
-# of what both halves see: a label of less has so much less to say about the strength
-LEAST_OF_LABEL = 1e-3
+STRENGTH = 0.25, 16.0  # views that knowledge counts for: at least, and at most
+# support of views by shape at which it is the least; it doubles for each .04 of support below that
+SUPPORTED, DOUBLES = 0.93, 0.04
+LEAST_OF_LABEL = 1e-3  # of what both halves see: a label of less has so much less to say
 BELIEVED = 0.6, 0.7  # share of labels of shape that equal those of a teacher sure of the scene
-LEAST_SHARE = 0.5  # strength, in mean evidence of a Gaussian that is seen
 
 
 class Shape(NamedTuple):
@@ -29,11 +27,13 @@ class Shape(NamedTuple):
     answers:       g, f32 [N, C], the surer the longer.
     embeddings:    [L, C] of the scene's labels.
     confused_with: i64 [L], the label that shape mostly gives to things of each label.
+    has_word:      bool [L]: shape has votes on a label.
     """
 
     answers: np.ndarray
     embeddings: np.ndarray
     confused_with: np.ndarray
+    has_word: np.ndarray
 
     def beside(self, features: np.ndarray) -> np.ndarray:
         """Answers that count beside features of views [N, C], zero where unseen: none where shape
@@ -44,19 +44,19 @@ class Shape(NamedTuple):
         blind &= features.any(1)
         return np.where(blind[:, None], 0, self.answers).astype(np.float32)
 
+    def compared(
+        self, features: np.ndarray, n_views: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gaussians by which views and shape can be compared, bool [N]: two views or more see them,
+        the label that these give has a word, and shape has a vote. Of each of these M: whether
+        both give one label, bool [M], and the vote's weight, f32 [M] by `trusted`.
 
-class Calibration(NamedTuple):
-    """Choices that the training views decide.
-
-    smooth:   features are smoothed, after they are blended.
-    strength: k, views that knowledge counts for; 0: it is left out.
-    curve:    agreement of the halves, mean cosine, by `calibrate`: for off at each strength that
-      was tried, for on of smoothed features without knowledge.
-    """
-
-    smooth: bool
-    strength: float
-    curve: dict[str, dict[float, float]]
+        Args: features [N, C] of the views, zero where unseen; n_views [N] that see each.
+        """
+        answers, labels = self.beside(features), decode_labels(features, self.embeddings)
+        rows = (n_views >= 2) & features.any(1) & answers.any(1) & self.has_word[labels]
+        same = decode_labels(answers[rows], self.embeddings) == labels[rows]
+        return rows, same, trusted(answers[rows], 1.0)
 
 
 def blend(
@@ -75,9 +75,8 @@ def blend(
 def trusted(knowledge: np.ndarray, strength: float) -> np.ndarray:
     """k' = k |g|^SURE: views that knowledge counts for, f32 [N].
 
-    Choices: an answer is the mean of unit vectors of a teacher over views, so that its length is
-      how alike these were where shapes were like this one; small things, of which shape reveals
-      least, are left to the views.
+    Choices: an answer is the mean of the words of points of like shape, so that its length is how
+      alike these were; small things, of which shape reveals least, are left to the views.
     """
     return np.asarray(strength * lengths(knowledge).clip(0, 1) ** SURE, np.float32)
 
@@ -147,30 +146,56 @@ def familiar(lifted: np.ndarray, knowledge: np.ndarray, embeddings: np.ndarray) 
     return min(sure / beside, 1.0) ** AGREED
 
 
-def believed(
-    lifted: np.ndarray,
-    n_views: np.ndarray,
-    knowledge: np.ndarray,
-    embeddings: np.ndarray,
-    worth: float,
-) -> float:
-    """Trust in shape in a scene, in [0, 1], before its strength is chosen.
+def believed(lifted: np.ndarray, n_views: np.ndarray, shape: Shape, worth: float) -> float:
+    """Trust in shape in a scene, in [0, 1].
 
-    Args: as for `familiar`; n_views [N] that see each Gaussian; worth: of `familiar`.
+    Args: lifted [N, C], the views' features of Gaussians, zero where unseen; n_views [N] that see
+      each; worth: of `familiar`.
     Choices: where a teacher knows the scene and many labels of shape, weighed by how sure it is of
       them, are not its own, it is shape that is wrong: another world than it was taught in. Below
       BELIEVED the trust is 0, above it 1. A teacher that is unsure of the scene is no judge.
     """
-    visible = (n_views >= 2) & lifted.any(1)
-    if not visible.any():
+    _, same, sure = shape.compared(lifted, n_views)
+    if not len(same):
         return 1.0
-    alike = decode_labels(lifted[visible], embeddings) == decode_labels(
-        knowledge[visible], embeddings
-    )
-    sure = trusted(knowledge[visible], 1.0)
-    share = float(alike @ sure / max(float(sure.sum()), 1e-12))
+    share = float(same @ sure / max(float(sure.sum()), 1e-12))
     alike_enough = float(np.clip((share - BELIEVED[0]) / (BELIEVED[1] - BELIEVED[0]), 0, 1))
     return max(alike_enough, 1 - worth)
+
+
+def supported(
+    lifted: np.ndarray, n_views: np.ndarray, agreement: np.ndarray, shape: Shape
+) -> float:
+    """s = p / √π. p: share of labels on which shape and the mean of the views agree. π: mean cosine
+    of two views; √π would be the accuracy of one view if errors were independent.
+
+    Args: agreement r [N] of all views, the length of the mean of their unit vectors; the others as
+      for `believed`.
+    Returns: 1 where no Gaussian can be compared.
+    Choices: π is the mean of (n r² - 1) / (n - 1); both means are weighed by how sure shape is.
+      Views that contradict shape more than each other have errors in common, which no number of
+      views shows.
+    """
+    rows, same, sure = shape.compared(lifted, n_views)
+    if not sure.sum() > 0:
+        return 1.0
+    n, r = n_views[rows].astype(np.float64), agreement[rows].astype(np.float64)
+    pairs = np.average(((n * r**2 - 1) / (n - 1)).clip(0, 1), weights=sure)
+    return float(np.average(same, weights=sure) / np.sqrt(max(pairs, 1e-6)))
+
+
+def strength_of(support: float, worth: float, belief: float) -> float:
+    """Views k that knowledge counts for: ¼ · 2^((.93 - s) / .04), up to 16, times worth, at least
+    ¼; all times belief.
+
+    Args: support s of `supported`; worth of `familiar`; belief of `believed`.
+    Choices: only shape corrects errors that views have in common. A teacher that is unsure of a
+      scene has its views count for less already. The numbers were chosen on training views of half
+      of the scenes of docs/results/shape.md.
+    """
+    least, most = STRENGTH
+    doublings = min((SUPPORTED - support) / DOUBLES, math.log2(most / least))
+    return max(least * math.pow(2, doublings) * worth, least) * belief
 
 
 def halves_agree(
@@ -182,60 +207,40 @@ def halves_agree(
     Args: halves [2, N, C], features by each half; half_views [2, N] how many of them see each;
       refined: what is made of each half, None: nothing.
     """
-    weights = np.where((half_views > 0).all(0), half_views, 0).astype(np.float64)
-    return _agreement(list(halves) if refined is None else refined, halves, weights)
+    weights = seen_by_both(half_views)
+    made = halves if refined is None else refined
+    total = sum(weights[1 - own] @ cosines(made[own], halves[1 - own]) for own in (0, 1))
+    return float(total / max(weights.sum(), 1e-30))
 
 
-def _agreement(predicted: Sequence[np.ndarray], halves: np.ndarray, weights: np.ndarray) -> float:
-    """Mean cosine of what each half predicts and the other half, weighted by the other's [2, N]."""
-    both = sum(float(weights[1 - own] @ cosines(predicted[own], halves[1 - own])) for own in (0, 1))
-    return both / max(float(weights.sum()), 1e-30)
-
-
-def calibrate(
+def labels_agree(
     halves: np.ndarray,
     half_views: np.ndarray,
-    near: Affinities,
-    shape: Shape | None = None,
-    alike: float = ALIKE,
-) -> Calibration:
-    """Choice of smoothing and of knowledge's strength: those by which half the views predict the
-    rest.
+    embeddings: np.ndarray,
+    refined: Sequence[np.ndarray] | None = None,
+) -> float | None:
+    """Share of one half's labels that the result of the other half reproduces, both ways; each
+    label weighs the same. None without a Gaussian that both see.
 
-    Args: halves [2, N, C], features by each half of the training views; half_views [2, N] how many
-      of them see each; near: affinities of the Gaussians; shape: None: only smoothing is decided;
-      alike: as for `effective`.
-    Returns: whether smoothing alone makes the halves agree better, and the strength at which they
-      agree best, of those from LEAST and from LEAST_SHARE of the mean evidence up; both fall to 0
-      with `alike`, since halves show errors that are not alike. Agreement is the cosine between
-      what is made of one half (smoothed, or blended by its own views) and the other half's mean
-      features, averaged over the Gaussians that both see, by the other half's views and, where
-      there is shape, every label of the views alike, both ways alike.
-    Choices: no test view is looked at, and no true label. On ties, and without a Gaussian that both
-      halves see, what changes less wins. The strength is that for features as they are: what
-      smoothing has made of a half is no longer evidence of its views alone, and asks for less.
-      Every label counts as much as another, as in mIoU: walls would choose for all.
+    Args: embeddings [L, C] of the labels; the others as for `halves_agree`.
     """
-    reliability = reliable(halves, half_views)
-    weights = np.where((half_views > 0).all(0), half_views, 0).astype(np.float64)
-    if shape is not None:
-        labels = decode_labels((half_views[..., None] * halves).sum(0), shape.embeddings)
-        of_label = np.bincount(labels, weights.sum(0))
-        weights /= np.maximum(of_label, max(LEAST_OF_LABEL * of_label.sum(), 1))[labels]
-    smoothed = [smooth(*of, near) for of in zip(halves, half_views, strict=True)]
-    curve = {0.0: _agreement(list(halves), halves, weights)}
-    on = _agreement(smoothed, halves, weights)
-    strength = 0.0
-    if shape is not None and weights.any():
-        evidence = [effective(n, alike) * reliability for n in half_views]
-        knowledge = [shape.beside(half) for half in halves]
-        for k in STRENGTHS[1:]:
-            blended = [blend(*of, k) for of in zip(halves, evidence, knowledge, strict=True)]
-            curve[k] = _agreement(blended, halves, weights)
-        whole, visible = effective(half_views.sum(0), alike) * reliability, half_views.any(0)
-        least = max(LEAST, LEAST_SHARE * float(whole[visible].mean())) * alike / ALIKE
-        strength = max((k for k in curve if k >= least), key=lambda k: (curve[k], -k))
-    return Calibration(on > curve[0.0], strength, {"off": curve, "on": {0.0: on}})
+    weights = seen_by_both(half_views)
+    if not weights.any():
+        return None
+    labels = [decode_labels(of, embeddings) for of in halves]
+    made = labels if refined is None else [decode_labels(of, embeddings) for of in refined]
+    shares = []
+    for own in (0, 1):
+        other, count = labels[1 - own], weights[1 - own]
+        of_label = np.bincount(other, count)
+        count = count / np.maximum(of_label, max(LEAST_OF_LABEL * of_label.sum(), 1))[other]
+        shares.append(count @ (made[own] == other) / count.sum())
+    return float(np.mean(shares))
+
+
+def seen_by_both(half_views: np.ndarray) -> np.ndarray:
+    """Numbers of views [2, N] of Gaussians that both halves see, 0 of others."""
+    return np.where((half_views > 0).all(0), half_views, 0).astype(np.float64)
 
 
 def start(which: str, lifted: np.ndarray, trained: np.ndarray | None) -> np.ndarray:

@@ -54,7 +54,7 @@ def odds(n_views: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Weight of each of N points in a lesson, f64 [N], sum 1: half alike, half by 1 /
     sqrt(frequency of its label).
 
-    Args: n_views [N], that see it; labels [N] that its teacher gives it.
+    Args: n_views [N], that see it; labels [N] that it is taught with.
     Raises: DataFailure where none is seen in LEAST_VIEWS views.
     """
     visible = (n_views >= LEAST_VIEWS).astype(np.float64)
@@ -105,12 +105,12 @@ def class_means(sums: Sums, embeddings: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Mean features z of the points of each class, f64 [K, p], and which classes these are, i64
     [K], in order: those of LEAST_OF_CLASS of the weight.
 
-    Args: sums: of points whose y ends in their class's embedding; embeddings [L, d]: of L <= d
+    Args: sums: of points whose y is their class's embedding; embeddings [L, C]: of L <= C
       classes, linearly independent.
-    Choices: b's last d columns are Σ_l (Σ w z over class l) e_lᵀ, which the embeddings'
-      pseudo-inverse takes apart; z ends in 1, so its last row is each class's share of the weight.
+    Choices: b is Σ_l (Σ w z over class l) e_lᵀ, which the embeddings' pseudo-inverse takes apart; z
+      ends in 1, so that its last row is each class's share of the weight.
     """
-    by_class = sums.cross[:, -embeddings.shape[1] :] @ np.linalg.pinv(embeddings.astype(np.float64))
+    by_class = sums.cross @ np.linalg.pinv(embeddings.astype(np.float64))
     present = np.flatnonzero(by_class[-1] >= LEAST_OF_CLASS)
     return (by_class[:, present] / by_class[-1, present]).T, present
 

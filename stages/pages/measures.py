@@ -34,7 +34,7 @@ class Measure:
 
 
 RIGHT = "pixels of training views with the true label"
-HALVES = "half the training views as the other half says (cosine)"
+HALVES = "labels of half the training views that the other half reproduces"
 MEASURES: dict[str, tuple[Measure, ...]] = {  # by stage: its error is the first that was measured
     "pose": (
         Measure("model", "reprojection_error_px", "points off their photos", PIXELS, lower=True),
@@ -93,12 +93,12 @@ MEASURES: dict[str, tuple[Measure, ...]] = {  # by stage: its error is the first
         Measure("gaussians", "right", RIGHT, PERCENT),
     ),
     "lift": (
-        Measure("lifted", "halves_agree", HALVES, NUMBER),
+        Measure("lifted", "labels_agree", HALVES, PERCENT),
         Measure("lifted", "right", RIGHT, PERCENT),
     ),
     "refine": (
-        Measure("refined", "halves_agree", HALVES, NUMBER),
-        Measure("refined", "gain", "more than lifting alone", NUMBER),
+        Measure("refined", "labels_agree", HALVES, PERCENT),
+        Measure("refined", "gain", "more than lifting alone", PERCENT),
         Measure("refined", "right", RIGHT, PERCENT),
     ),
     "export": (
@@ -182,7 +182,7 @@ def course_of(
     factor = (end - begin) / max(trace[-1]["seconds"], 1e-9)
     colors = [(begin + factor * entry["seconds"], entry["psnr"]) for entry in trace]
     colors.append((ends[-1], trace[-1]["psnr"]))
-    for fact, words in (("right", RIGHT), ("halves_agree", HALVES)):
+    for fact, words in (("right", RIGHT), ("labels_agree", HALVES)):
         roles = [
             (stage, end, of.role)
             for stage, _, end in spans

@@ -44,19 +44,23 @@ def started(inputs: dict[str, Path], facts: dict[str, dict[str, Any]]) -> Starte
 
 
 def worth(refined: dict[str, Any]) -> list[tuple[str, str]]:
-    """Worth of knowledge: agreement of half the views with the other half, without and with it."""
-    if "curve" not in refined:
+    """Labels of half the views that the other half reproduces, without knowledge and with it."""
+    if "believed" not in refined:
         return []
-    curve, belief = refined["curve"]["off"], refined["believed"]
-    strength = f"{refined['strength'] / belief:g}" if belief else "0"
-    if strength not in curve or strength == "0":
-        return [("worth on training views held out", "not told: it counts for nothing here")]
-    agreed = f"agreement, labels alike, {curve['0']:.4f} without it, {curve[strength]:.4f} with it"
-    views = "1 view" if strength == "1" else f"{strength} views"
-    views += (
-        "" if belief == 1 else (f", of which {belief:.0%} is believed: the teacher says otherwise")
-    )
-    return [("worth on training views held out", f"{agreed}, counting as {views}")]
+    if "halves" not in refined:
+        return [
+            (
+                "labels of half the training views that the other half reproduces",
+                "not told: it counts for nothing here",
+            )
+        ]
+    without, with_it = refined["halves"]["without"], refined["halves"]["with"]
+    belief = refined["believed"]
+    views = f"{without:.1%} without it, {with_it:.1%} with it"
+    views += f", counting as {refined['strength']:.2g} views"
+    if belief < 1:
+        views += f", of which {belief:.0%} is believed: the teacher says otherwise"
+    return [("labels of half the training views that the other half reproduces", views)]
 
 
 def left_behind(lesson: dict[str, Any]) -> list[tuple[str, str]]:

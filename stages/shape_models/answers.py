@@ -12,6 +12,7 @@ from chebsplat.formats.descriptors import Descriptors
 from chebsplat.formats.features import Features
 from chebsplat.formats.knowledge import Knowledge
 from chebsplat.labels.decode import decode_labels, shares
+from chebsplat.lifting.blend import Shape
 from chebsplat.shape.point_encoder import PointEncoder
 from chebsplat.shape.point_inputs import PointInputs
 from chebsplat.stages.teacher_models.text_encoder import match_names
@@ -41,7 +42,7 @@ def inputs_of(path: Path, descriptors: Descriptors, knowledge: Knowledge) -> Poi
 
 
 def answered(knowledge: Knowledge, inputs: PointInputs) -> np.ndarray:
-    """Answers of knowledge at points, f32 [N, 2 d]: in the teacher's channels, then of words."""
+    """Answers of knowledge at points, f32 [N, d], among the embeddings of its words."""
     return encoded(knowledge, inputs) @ knowledge.map
 
 
@@ -53,7 +54,7 @@ def encoded(knowledge: Knowledge, inputs: PointInputs) -> np.ndarray:
 def into_channels(
     path: Path, knowledge: Knowledge, features: Features
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """From answers [N, 2 d] to the scene's channels [N, C]: by the teacher's channels, or by words.
+    """From answers [N, d] to the scene's channels [N, C]: by the teacher's channels, or by words.
 
     Raises: InputError where the knowledge is of another teacher than the scene's; DataFailure where
       it has no word for any of its labels.
@@ -62,15 +63,14 @@ def into_channels(
       an answer becomes the mean of the codes, weighted by its similarity to the embeddings of their
       names; a label without a word gets no vote.
     """
-    half = len(knowledge.map[0]) // 2
     if of_features(features):
         check_teacher(path, knowledge, features)
         channels = features.channels
         matrix = knowledge.matrix.T if channels is None else knowledge.matrix.T @ channels.matrix
-        return lambda answers: answers[:, :half] @ matrix
+        return lambda answers: answers @ matrix
     named, embeddings = words_of(path, knowledge, features)
     codes = features.label_embeddings[named]
-    return lambda answers: shares(answers[:, half:], embeddings, TEMPERATURE) @ codes
+    return lambda answers: shares(answers, embeddings, TEMPERATURE) @ codes
 
 
 def confused_with(path: Path, knowledge: Knowledge, features: Features) -> np.ndarray:
@@ -91,43 +91,33 @@ def confused_with(path: Path, knowledge: Knowledge, features: Features) -> np.nd
     return np.where(rows >= 0, labels[rows], own)
 
 
-def into_meanings(
-    path: Path, knowledge: Knowledge, features: Features
-) -> Callable[[int], np.ndarray]:
-    """Target of knowledge for each entry of a view, f32 [h, w, d] of a view's number: the teacher's
-    features in knowledge's channels, or the word of its label; zero without a label or a word.
+def answering(path: Path, knowledge: Knowledge, features: Features, answers: np.ndarray) -> Shape:
+    """Shape that gives these answers [N, C], in the scene's channels.
 
+    Args: knowledge: read from `path`.
+    Raises: as `into_channels`.
+    """
+    missing = unnamed(knowledge, features)
+    has_word = np.array([name not in missing for name in features.label_names])
+    confused = confused_with(path, knowledge, features)
+    return Shape(answers, features.label_embeddings, confused, has_word)
+
+
+def words_by_label(path: Path, knowledge: Knowledge, features: Features) -> np.ndarray:
+    """Unit embedding of each label in knowledge's channels, f32 [L, d]; zero without a word, and
+    where the scene's channels hold so little of it that it would be read as another label.
+
+    Args: knowledge: read from `path`.
     Raises: as `into_channels`.
     """
     if of_features(features):
-        check_teacher(path, knowledge, features)
-        matrix = to_knowledge(knowledge, features)
-        return lambda view: features.features[view].astype(np.float32) @ matrix
-    words = words_by_label(knowledge, features)
-
-    def meanings(view: int) -> np.ndarray:
-        if features.pseudo_labels is not None:
-            return words[features.pseudo_labels[view]]
-        return words[
-            decode_labels(features.features[view].astype(np.float32), features.label_embeddings)
-        ]
-
-    return meanings
-
-
-def to_knowledge(knowledge: Knowledge, features: Features) -> np.ndarray:
-    """The matrix f32 [C, d] from a scene's channels, of a teacher's features, to knowledge's."""
-    return (
-        knowledge.matrix
-        if features.channels is None
-        else features.channels.inverse @ knowledge.matrix
-    )
-
-
-def words_by_label(knowledge: Knowledge, features: Features) -> np.ndarray:
-    """Unit embedding of each label's word, f32 [L + 1, d]; zero of labels without one, and last."""
-    rows = np.array([*match_names(features.label_names, knowledge.words), -1])
-    return np.where(rows[:, None] >= 0, units(knowledge.embeddings[rows]), 0).astype(np.float32)
+        of, channels = features.label_embeddings, features.channels
+        words = units((of if channels is None else of @ channels.inverse) @ knowledge.matrix)
+    else:
+        rows = np.array(match_names(features.label_names, knowledge.words))
+        words = np.where(rows[:, None] >= 0, units(knowledge.embeddings[rows]), 0)
+    read = decode_labels(into_channels(path, knowledge, features)(words), features.label_embeddings)
+    return np.where((read == np.arange(len(words)))[:, None], words, 0).astype(np.float32)
 
 
 def of_features(features: Features) -> bool:

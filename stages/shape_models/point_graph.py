@@ -257,7 +257,7 @@ def point_contract(encoder: PointEncoder, knowledge: Knowledge) -> dict[str, Any
                 "float32",
                 [n, knowledge.map.shape[1]],
                 "none",
-                f"half in channels of {knowledge.teacher}, half of words",
+                f"among the embeddings of words by {knowledge.teacher}",
             )
         },
         "normalization": "none outside the graph",

@@ -202,8 +202,8 @@ def label_ply(
     warn_of_new_kind(prior, shape, answers)
     normals = surface_of(parameters)[0]
     carried, _ = carry(answers, cloud.means, cloud.normals, parameters["means"], normals, unit)
-    labels, sure = decode(carried[:, carried.shape[1] // 2 :], units(prior.embeddings[rows]))
-    confidence = sure * np.linalg.norm(carried[:, carried.shape[1] // 2 :], axis=1).clip(0, 1)
+    labels, sure = decode(carried, units(prior.embeddings[rows]))
+    confidence = sure * np.linalg.norm(carried, axis=1).clip(0, 1)
     with atomic_path(beside) as temporary, temporary.open("wb") as stream:
         np.savez(
             stream, names=np.array(words), labels=labels, confidence=confidence.astype(np.float32)
@@ -215,7 +215,7 @@ def label_ply(
 
 
 def warn_of_new_kind(knowledge: Knowledge, shape: np.ndarray, answers: np.ndarray) -> None:
-    """Warn if shape features [N, p] are unlike all rooms of knowledge, so that its answers [N, 2 d]
+    """Warn if shape features [N, p] are unlike all rooms of knowledge, so that its answers [N, d]
     are unreliable: ρ′ of Eq 15 is compared with that of held-out rooms, with surfaces worn as a
     splat's.
     """

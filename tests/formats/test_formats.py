@@ -179,7 +179,7 @@ def make_refined():
         "start": "trained",
         "smooth": True,
         "strength": 2.0,
-        "curve": {"off": {"0": 0.9}, "on": {"0": 0.95}},
+        "halves": {"without": 0.8, "with": 0.9},
     }
     return lifted.Refined(
         rng.normal(size=(6, 4)).astype(np.float32), rng.random(6, dtype=np.float32), notes

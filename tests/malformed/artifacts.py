@@ -313,7 +313,7 @@ def _refined(out: Path) -> None:
         "start": "trained",
         "smooth": True,
         "strength": 0.0,
-        "curve": {"off": {"0": 0.8}, "on": {"0": 0.9}},
+        "halves": {"without": 0.8, "with": 0.9},
     }
     Refined(features, np.ones(N, np.float32), notes).write(out)
 

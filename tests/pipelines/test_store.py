@@ -96,12 +96,12 @@ def test_links_and_heads_never_lead_out_of_the_work_folder(work, name):
 @pytest.mark.parametrize("key", ["/tmp/elsewhere", "../../../elsewhere", "", "abc"])
 def test_a_folder_s_manifest_cannot_say_where_its_copy_goes(work, tmp_path, key):
     folder = tmp_path / "knowledge"
-    with artifact.publish(folder, Manifest("chebsplat.knowledge/3", key_of("a"), "teach")):
+    with artifact.publish(folder, Manifest("chebsplat.knowledge/4", key_of("a"), "teach")):
         pass
     file = folder / "artifact.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"key": key}))
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError, match="damaged: key"):
-        store.import_artifact(folder, "teach", "chebsplat.knowledge/3", running=True)
+        store.import_artifact(folder, "teach", "chebsplat.knowledge/4", running=True)
     assert sorted(tmp_path.rglob("*")) == before
     assert not os.path.lexists("/tmp/elsewhere")

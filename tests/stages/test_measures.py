@@ -59,11 +59,11 @@ MACHINE = {
 
 
 def test_a_row_tells_the_error_first_which_way_is_better_and_every_machine():
-    facts = {"refined": {"halves_agree": 0.9, "gain": None, "right": 0.5}}
+    facts = {"refined": {"labels_agree": 0.9, "gain": None, "right": 0.5}}
     processes = [MACHINE, MACHINE | {"processor": "B", "cores": 4, "load": [0.1, 1.0]}]
     row = row_of("refine", Manifest("s/1", KEY, "refine", seconds=7.5, processes=processes), facts)
     assert row.figures == [
-        "0.9 ↑ half the training views as the other half says (cosine)",
+        "90.00% ↑ labels of half the training views that the other half reproduces",
         "50.00% ↑ pixels of training views with the true label",
     ]
     assert row[:3] == ("refine", 7.5, KEY)
@@ -100,7 +100,7 @@ def test_a_scene_s_course_is_its_stages_one_after_the_other_and_its_stops_are_re
     early = course_of(rows, facts, [{"seconds": 2.0, "psnr": 14.0}, *trace], 12.0)
     assert stops(early)[1] == ("a quarter of the training", 25, 16.25, 0.5)
     # no true labels: halves of the views
-    without = course_of(rows, {"lifted": {"halves_agree": 0.9}}, trace, 12.0)
+    without = course_of(rows, {"lifted": {"labels_agree": 0.9}}, trace, 12.0)
     assert without.meanings == [("lift", 60, 0.9)] and "half the training views" in without.words
     assert course_of(rows, {}, trace, 12.0).meanings == []
 

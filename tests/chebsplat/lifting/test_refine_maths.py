@@ -9,26 +9,25 @@ import pytest
 
 from chebsplat.lifting.blend import (
     ALIKE,
-    LEAST,
-    STRENGTHS,
     Shape,
     believed,
     blend,
-    calibrate,
     confidence,
     effective,
     errors_alike,
     familiar,
     halves_agree,
+    labels_agree,
     reliable,
     start,
+    strength_of,
+    supported,
 )
 from chebsplat.lifting.observations import carry
 from chebsplat.lifting.smoothing import (
     N_NEIGHBORS,
     PASSES,
     REACH,
-    Affinities,
     affinities,
     room_unit,
     smooth,
@@ -175,35 +174,39 @@ def test_errors_of_views_are_told_to_be_their_own_or_their_neighbours_too():
     np.testing.assert_allclose(effective(np.array([1, 6, 100]), 0.0), [1, 6, 100])
 
 
-def test_where_errors_are_not_alike_many_views_outweigh_knowledge_that_is_wrong():
-    halves, n_views, truth, near = votes(100, 0.02)
-    wrong = answering(truth[:, ::-1].copy())
-    assert calibrate(halves, n_views, near, wrong).strength > LEAST
-    assert calibrate(halves, n_views, near, wrong, 0.0).strength == 0
-
-
-def test_every_label_decides_alike_how_strong_knowledge_is():
-    halves, n_views, truth, near = votes(2, 0.3, rare=0.05)
-    rare = truth[:, 1] > 0
-    assert 5 < rare.sum() < 40
-    halves[:, rare] = truth[rare]  # on which all views agree
-    blind = answering(np.eye(4)[np.zeros(400, int)])  # right about the frequent label alone
-    evidence = effective(n_views[0], 0.0) * reliable(halves, n_views)
-    by_views = [
-        (unit(blend(halves[0], evidence, blind.answers, k)) * halves[1]).sum() for k in STRENGTHS
-    ]
-    assert calibrate(halves, n_views, near, blind, 0.0).strength < STRENGTHS[np.argmax(by_views)]
+def test_shape_counts_for_more_the_more_views_that_agree_contradict_it():
+    rng = np.random.default_rng(2)
+    shape = answering(np.eye(4)[rng.integers(0, 4, 3000)])
+    wrong = rng.random(3000) < 0.3
+    n = np.full(3000, 10)
+    # of one mind, and each time wrong about the same things
+    confident = np.where(wrong[:, None], np.roll(shape.answers, 1, 1), shape.answers)
+    assert supported(confident, n, np.ones(3000), shape) == pytest.approx(0.7, abs=0.02)
+    assert supported(shape.answers, n, np.ones(3000), shape) == 1
+    # each view wrong about others, as often: the mean is right
+    labels = np.where(
+        rng.random((10, 3000)) < 0.3, rng.integers(0, 4, (10, 3000)), shape.answers.argmax(1)
+    )
+    means = np.eye(4)[labels].mean(0)
+    assert supported(means, n, np.linalg.norm(means, axis=1), shape) > 1.2
+    assert supported(0 * means, n, n, shape) == supported(means, n // 10, n, shape) == 1  # unknown
+    least, most = strength_of(1.2, 1, 1), strength_of(0, 1, 1)
+    assert least == strength_of(0.93, 1, 1) == 0.25 and most == 16
+    assert strength_of(0.81, 1, 1) == pytest.approx(2)
+    # an unsure teacher has its views count for less already
+    assert strength_of(0.81, 0.5, 1) == pytest.approx(1) and strength_of(0.3, 0.01, 1) == 0.25
+    assert strength_of(0.81, 1, 0.5) == pytest.approx(1) and strength_of(0, 1, 0) == 0
 
 
 def test_shape_has_no_vote_where_views_tell_what_it_takes_for_the_same():
-    desk, keyboard, lamp = labels = np.eye(3)
+    (desk, keyboard, lamp), every = (labels := np.eye(3)), np.full(3, True)
     answers = np.stack([desk, desk, desk, lamp, 0.5 * desk]).astype(np.float32)
     seen = np.stack([desk, keyboard, lamp, keyboard, 2 * keyboard])
-    blind = Shape(answers, labels, np.array([0, 0, 2]))  # a keyboard is a desk to it
+    blind = Shape(answers, labels, np.array([0, 0, 2]), every)  # a keyboard is a desk to it
     np.testing.assert_array_equal(blind.beside(seen).any(1), [True, False, True, True, False])
-    np.testing.assert_array_equal(Shape(answers, labels, np.arange(3)).beside(seen), answers)
-    desks = Shape(answers, labels, np.array([1, 1, 2]))  # a desk is a keyboard to it
-    given = Shape(np.tile(keyboard, (2, 1)), labels, desks.confused_with)
+    np.testing.assert_array_equal(Shape(answers, labels, np.arange(3), every).beside(seen), answers)
+    desks = Shape(answers, labels, np.array([1, 1, 2]), every)  # a desk is a keyboard to it
+    given = Shape(np.tile(keyboard, (2, 1)), labels, desks.confused_with, every)
     np.testing.assert_array_equal(given.beside(np.stack([desk, 0 * desk])).any(1), [False, True])
 
 
@@ -272,7 +275,7 @@ def test_confidence_grows_with_votes_that_agree_and_falls_where_they_do_not():
 
 def answering(answers):
     """Shape that tells all four labels of `votes` apart."""
-    return Shape(answers.astype(np.float32), np.eye(4), np.arange(4))
+    return Shape(answers.astype(np.float32), np.eye(4), np.arange(4), np.full(4, True))
 
 
 def votes(n_views, spread, seed=0, rare=0.5):
@@ -291,62 +294,39 @@ def votes(n_views, spread, seed=0, rare=0.5):
     return halves.astype(np.float32), np.full((2, 400), n_views), truth, near
 
 
-def test_calibration_smooths_where_votes_are_noisy_and_not_where_neighbours_differ():
+def test_halves_agree_better_smoothed_where_votes_are_noisy_and_not_where_neighbours_differ():
     halves, n_views, _, near = votes(2, 1.0)
-    found = calibrate(halves, n_views, near)
-    assert found.smooth
-    assert found.strength == 0
-    assert set(found.curve["on"]) == set(found.curve["off"]) == {0.0}
-    rng = np.random.default_rng(3)
+    smoothed = [smooth(*of, near) for of in zip(halves, n_views, strict=True)]
+    assert halves_agree(halves, n_views, smoothed) > halves_agree(halves, n_views) + 0.05
     # each Gaussian is something else, and all views agree on it
-    own = unit(rng.normal(size=(400, 4)))
-    assert not calibrate(np.stack([own, own]), n_views, near).smooth
+    own = np.tile(unit(np.random.default_rng(3).normal(size=(400, 4))), (2, 1, 1))
+    smoothed = [smooth(*of, near) for of in zip(own, n_views, strict=True)]
+    assert halves_agree(own, n_views, smoothed) < halves_agree(own, n_views) == pytest.approx(1)
 
 
-def test_the_halves_agree_as_calibration_has_it():
-    halves, n_views, _, near = votes(2, 1.0)
+def test_halves_are_compared_both_ways_where_both_see():
+    halves, n_views, _, _ = votes(2, 1.0)
     n_views = n_views.copy()
     n_views[0, ::3] = 0  # of one half alone: not counted
-    assert halves_agree(halves, n_views) == pytest.approx(
-        calibrate(halves, n_views, near).curve["off"][0.0]
-    )
-    smoothed = [smooth(*of, near) for of in zip(halves, n_views, strict=True)]
-    assert halves_agree(halves, n_views, smoothed) == pytest.approx(
-        calibrate(halves, n_views, near).curve["on"][0.0]
-    )
-    assert halves_agree(halves[[0, 0]], n_views) == pytest.approx(1)
+    n_views[1, 1::3] = 6
+    weights = n_views[:, n_views.all(0)]
+    cosines = (unit(halves[0]) * unit(halves[1])).sum(1)[n_views.all(0)]
+    expected = (weights * cosines).sum() / weights.sum()
+    assert halves_agree(halves, n_views) == pytest.approx(expected, rel=1e-5)
+    assert halves_agree(halves[::-1], n_views[::-1]) == pytest.approx(expected, rel=1e-5)
+    assert halves_agree(halves, n_views, halves[::-1]) == pytest.approx(1)
     assert halves_agree(halves, n_views * np.array([[1], [0]])) == 0
 
 
-def test_calibration_trusts_knowledge_as_far_as_views_are_noisy():
-    chosen = {}
-    for spread in (0.02, 1.0):
-        halves, n_views, truth, near = votes(2, spread)
-        # knowledge errs, too
-        wrong = np.where(np.arange(400)[:, None] % 10 == 0, np.eye(4)[3], truth)
-        near = Affinities(near.neighbors, np.zeros_like(near.weights))
-        found = calibrate(halves, n_views, near, answering(wrong))
-        assert set(found.curve["off"]) == set(STRENGTHS)
-        assert not found.smooth  # nobody has a neighbour: a tie
-        evidence = effective(n_views.sum(0)) * reliable(halves, n_views)
-        assert found.strength >= max(LEAST, evidence.mean() / 2)
-        chosen[spread] = found.strength / (evidence.mean() + found.strength)  # its share of a vote
-    assert chosen[0.02] < 0.5 < chosen[1.0]
-
-
-def test_calibration_treats_both_halves_alike_and_ignores_what_one_half_does_not_see():
-    halves, n_views, truth, near = votes(2, 1.0)
-    truth = answering(truth)
-    turned = calibrate(halves[::-1], n_views[::-1], near, truth)
-    there = calibrate(halves, n_views, near, truth)
-    assert turned[:2] == there[:2]
-    np.testing.assert_allclose(
-        list(turned.curve["on"].values()), list(there.curve["on"].values()), rtol=1e-12
-    )
-    many = calibrate(halves, 100 * n_views, near, truth)  # agree wholly, and may err alike
-    assert many.strength >= effective(np.array([400])).item() / 2 * reliable(halves, n_views).mean()
-    none = calibrate(halves, n_views * np.array([[1], [0]]), near, truth)
-    assert none[:2] == (False, 0.0)
+def test_every_label_counts_alike_in_what_halves_have_alike():
+    _, n_views, truth, _ = votes(2, 0.3, rare=0.05)
+    rare = truth[:, 1] > 0
+    assert 5 < rare.sum() < 40
+    both, blind = np.stack([truth, truth]), np.eye(4)[np.zeros(400, int)]
+    assert labels_agree(both, n_views, np.eye(4)) == 1
+    assert labels_agree(both, n_views, np.eye(4), [blind, blind]) == pytest.approx(0.5)
+    assert labels_agree(both, n_views, np.eye(4), [truth, blind]) == pytest.approx(0.75)
+    assert labels_agree(both, n_views * np.array([[1], [0]]), np.eye(4)) is None
 
 
 def test_carrying_over_is_its_formula(scene):
@@ -395,7 +375,13 @@ def test_shape_is_believed_where_its_labels_are_a_knowing_teachers_or_the_teache
     views, seen = codes[labels], np.full(2000, 3)
     for share, least, most in ((0.9, 1, 1), (0.65, 0.4, 0.6), (0.4, 0, 0)):
         said = np.where(rng.random(2000) < share, labels, (labels + 1) % 5)
-        found = believed(views, seen, codes[said], codes, worth=1.0)
+        shape = Shape(codes[said], codes, np.arange(5), np.full(5, True))
+        found = believed(views, seen, shape, worth=1.0)
         assert least <= found <= most
-        assert believed(views, seen, codes[said], codes, worth=0.1) == max(found, 0.9)
-    assert believed(views, 0 * seen, codes[said], codes, worth=1.0) == 1  # nobody to ask
+        assert believed(views, seen, shape, worth=0.1) == max(found, 0.9)
+    assert believed(views, 0 * seen, shape, worth=1.0) == 1  # nobody to ask
+    # what shape has no word for, it cannot be wrong about
+    lost = labels == 4
+    unanswered = Shape(codes[np.where(lost, 0, labels)], codes, np.arange(5), np.arange(5) < 4)
+    assert believed(views, seen, unanswered, worth=1.0) == 1
+    assert supported(views, seen, np.ones(2000), unanswered) == 1
