@@ -91,13 +91,15 @@ def run(job: Job) -> None:
             raise DataFailure(encoding.notes["none"])
         if settings.points is not None:
             world = World.read(capture.source)
-            taught = by_points(Path(settings.points), start, descriptors, world, z)
+            teaching = by_points(Path(settings.points), start, descriptors, world, z)
             notes |= {"given": True, "teacher": "labelled points"}
         else:
             points = Points.read(job.inputs["points"])
-            taught = by_views(job.inputs["start"], start, capture, points, features, descriptors, z)
+            teaching = by_views(
+                job.inputs["start"], start, capture, points, features, descriptors, z
+            )
             notes["unnamed"] = unnamed(start, features)
-        weights = odds(taught.n_views, taught.labels)
+        weights = odds(teaching.n_views, teaching.labels)
     except DataFailure as error:
         job.left_out("a lesson", str(error))
         p, d = start.map.shape
@@ -110,17 +112,17 @@ def run(job: Job) -> None:
             f"knowledge has no word for {', '.join(notes['unnamed'])}: not learned, and no vote "
             "from shape",
         )
-    sums = summed(z, taught.words, weights)
+    sums = summed(z, teaching.words, weights)
     rho, spread = novelty(sums, start.scale, start.basis), sums.spread()
     notes |= {
-        "n_points": int((taught.n_views >= LEAST_VIEWS).sum()),
-        "n_labels": len(np.unique(taught.labels[weights > 0])),
+        "n_points": int((teaching.n_views >= LEAST_VIEWS).sum()),
+        "n_labels": len(np.unique(teaching.labels[weights > 0])),
         "rho": rho,
         "sigma": spread,
         "novelty": scaled_novelty(rho, spread),
         "known": KNOWN * start.card["novelty"][KIND[descriptors.notes["of"]]],
-        "familiar": taught.familiar,
-        "alike": taught.alike,
+        "familiar": teaching.familiar,
+        "alike": teaching.alike,
     }
     job.facts |= notes | {"unexplained": unexplained(sums, start.map.astype(np.float64))}
     write_lesson(job.out, Lesson(sums, notes))

@@ -208,8 +208,8 @@ def halves_agree(
       refined: what is made of each half, None: nothing.
     """
     weights = seen_by_both(half_views)
-    made = halves if refined is None else refined
-    total = sum(weights[1 - own] @ cosines(made[own], halves[1 - own]) for own in (0, 1))
+    results = halves if refined is None else refined
+    total = sum(weights[1 - own] @ cosines(results[own], halves[1 - own]) for own in (0, 1))
     return float(total / max(weights.sum(), 1e-30))
 
 
@@ -228,13 +228,13 @@ def labels_agree(
     if not weights.any():
         return None
     labels = [decode_labels(of, embeddings) for of in halves]
-    made = labels if refined is None else [decode_labels(of, embeddings) for of in refined]
+    results = labels if refined is None else [decode_labels(of, embeddings) for of in refined]
     shares = []
     for own in (0, 1):
         other, count = labels[1 - own], weights[1 - own]
         of_label = np.bincount(other, count)
         count = count / np.maximum(of_label, max(LEAST_OF_LABEL * of_label.sum(), 1))[other]
-        shares.append(count @ (made[own] == other) / count.sum())
+        shares.append(count @ (results[own] == other) / count.sum())
     return float(np.mean(shares))
 
 
