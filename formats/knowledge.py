@@ -31,7 +31,7 @@ class Knowledge:
     encoder:    constructor settings of the point encoder; weights: its arrays by name.
     matrix:     f32 [C, d], from the teacher's C channels to d; columns orthonormal.
     describe:   settings of the descriptors that the encoder reads.
-    words:      W words of the vocabulary; embeddings f16 [W, d], unit.
+    words:      W words of the vocabulary; embeddings f16 [W, d], unit before `matrix`.
     map:        f32 [p, d], from features of shape to the embeddings of words.
     basis:      f32 [p, r], of features times scale f32 [p]: the subspace learned so far (Eq 15).
     classes:    K classes that it was taught; class_means f32 [K, p], the mean features of shape of

@@ -113,11 +113,12 @@ def words_by_label(path: Path, knowledge: Knowledge, features: Features) -> np.n
     if of_features(features):
         of, channels = features.label_embeddings, features.channels
         words = units((of if channels is None else of @ channels.inverse) @ knowledge.matrix)
+        read = decode_labels(into_channels(path, knowledge, features)(words), of)
+        known = read == np.arange(len(words))
     else:
         rows = np.array(match_names(features.label_names, knowledge.words))
-        words = np.where(rows[:, None] >= 0, units(knowledge.embeddings[rows]), 0)
-    read = decode_labels(into_channels(path, knowledge, features)(words), features.label_embeddings)
-    return np.where((read == np.arange(len(words)))[:, None], words, 0).astype(np.float32)
+        words, known = units(knowledge.embeddings[rows]), rows >= 0
+    return np.where(known[:, None], words, 0).astype(np.float32)
 
 
 def of_features(features: Features) -> bool:

@@ -32,6 +32,7 @@ from chebsplat.stages.shape_models.answers import (
     confused_with,
     into_channels,
     units,
+    words_by_label,
 )
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.synthetic import CLASS_NAMES
@@ -165,6 +166,11 @@ def test_scenes_of_codes_meet_knowledge_through_words(toy):
         share = np.exp(embeddings @ embeddings[lost:].T / TEMPERATURE)
         share /= share.sum(1, keepdims=True)
         np.testing.assert_allclose(made, share @ features.label_embeddings[lost:], atol=1e-4)
+        learned = words_by_label(toy["teach"], knowledge, features)
+        np.testing.assert_array_equal(learned.any(1), np.arange(len(words)) >= lost)
+    features.label_names = [others[0], *others]  # two labels of one word: both teach it
+    learned = words_by_label(toy["teach"], knowledge, features)
+    assert learned.any(1).all() and (learned[0] == learned[1]).all()
 
 
 @pytest.mark.xdist_group("toy")
