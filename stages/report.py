@@ -248,6 +248,7 @@ def summary_rows(
         Figure(f"PSNR, dB (8-bit, mean over views{of})", image["psnr"], form="{:.2f}"),
         Figure("PSNR after a colour fit by view, dB", image.get("psnr_fit"), form="{:.2f}"),
         *taken_rows(image.get("as_taken")),
+        *shown_rows(image.get("where_shown")),
         Figure("SSIM (window 11, σ 1.5)", image["ssim"], form="{:.4f}"),
         Figure("LPIPS (vgg, images in [0, 1])", figures["lpips"], form="{:.3f}"),
     ]
@@ -315,6 +316,16 @@ def taken_rows(figures: dict[str, Any] | None) -> list[Figure]:
     return [
         Figure(f"PSNR on the photos as taken, {size} pixels, dB", figures["psnr"], form="{:.2f}"),
         Figure("SSIM on them", figures["ssim"], form="{:.4f}"),
+    ]
+
+
+def shown_rows(figures: dict[str, Any] | None) -> list[Figure]:
+    """PSNR of the test pixels that training photos show; nothing where depth cannot tell."""
+    if figures is None:
+        return []
+    share = f"{figures['share']:.0%} of the pixels"
+    return [
+        Figure(f"PSNR where training photos looked, {share}, dB", figures["psnr"], form="{:.2f}")
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import mode
 from typing import Any
@@ -15,16 +16,19 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from scipy.ndimage import map_coordinates
 
+from chebsplat.cameras import unproject
 from chebsplat.errors import InputError
 from chebsplat.evaluation.lpips import Lpips
 from chebsplat.evaluation.metrics import color_fitted, psnr
 from chebsplat.formats.capture import Capture
+from chebsplat.formats.record import Stack
 from chebsplat.kernels.threads import n_threads
 from chebsplat.render import PARTS, SceneRenderer, focals, frame_parts
 from chebsplat.training.losses import ssim
 from chebsplat.views import View
 
 LEAST_SIDE = 16  # pixels, of LPIPS
+SAME_SURFACE = 0.05  # of a depth: two views that differ by less show the same surface
 
 
 def image_figures(
@@ -52,6 +56,57 @@ def image_figures(
             per_view["lpips"].append(lpips.distance(filled, true))
     means = {name: float(np.array(values).mean()) for name, values in per_view.items()}
     return {"lpips": None} | means | {"per_view": per_view}
+
+
+def figures_where_shown(
+    renders: np.ndarray, truth: np.ndarray, shown: list[np.ndarray]
+) -> dict[str, Any] | None:
+    """PSNR, dB, of the pixels that training photos show, `shown` bool [H, W] of each view, and
+    their `share`; None where they show none of any.
+    """
+    psnrs = [
+        min(psnr(render[pixels], true[pixels]), 100.0) if pixels.any() else None
+        for render, true, pixels in zip(renders, truth, shown, strict=True)
+    ]
+    counted = [value for value in psnrs if value is not None]
+    if not counted:
+        return None
+    share = float(np.mean([pixels.mean() for pixels in shown]))
+    return {"psnr": float(np.mean(counted)), "share": share, "per_view": {"psnr": psnrs}}
+
+
+def shown_pixels(
+    views: Sequence[int],
+    others: Sequence[int],
+    depth: Stack,
+    Ks: np.ndarray,
+    cam_from_world: np.ndarray,
+) -> list[np.ndarray]:
+    """Pixels bool [H, W] of each view whose surface one of the `others` shows, by measured depth.
+
+    Args: depth: f32 [V, H, W] z, scene units, nan where unknown: such pixels are not shown; Ks
+      [V, 3, 3]; cam_from_world [V, 4, 4].
+    """
+    shown, left = [np.zeros(depth.shape[1:], bool) for _ in views], {}
+    for view in views:
+        own = depth[view]
+        pixels = np.argwhere(own > 0)
+        left[view] = pixels, unproject(own, Ks[view], cam_from_world[view], pixels)
+    for other in others:
+        pose, there = cam_from_world[other], depth[other]
+        for view, mask in zip(views, shown, strict=True):
+            if view == other or not len(left[view][0]):
+                continue
+            pixels, world = left[view]
+            projected = (world @ pose[:3, :3].T + pose[:3, 3]) @ Ks[other].T
+            z = np.where(projected[:, 2] > 0, projected[:, 2], np.nan)
+            places = np.floor(projected[:, 1::-1] / z[:, None])
+            found = ((places >= 0) & (places < there.shape)).all(1)  # nan is neither
+            rows, columns = places[found].astype(int).T
+            found[found] = np.abs(there[rows, columns] / z[found] - 1) < SAME_SURFACE
+            mask[tuple(pixels[found].T)] = True
+            left[view] = pixels[~found], world[~found]
+    return shown
 
 
 def figures_as_taken(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from pathlib import Path
 from typing import Any
@@ -31,13 +31,16 @@ from chebsplat.stages.sources.common import Shot, file_of
 
 log = logging.getLogger("chebsplat")
 MORE = 1.1  # times the photos of the best so far, that a costlier attempt must register
-HALF = 0.5  # of the photos: where a plain lens registers so many, no fisheye's is tried
+HALF = 0.5  # of the photos: where fewer register, mapping begins again, then as a fisheye's
 FISHEYE = "OPENCV_FISHEYE"
 FAINT = 0.002  # SIFT's peak threshold where the usual one finds too little; it costs exactness
 WIDE = 0.5  # a fisheye's focal length in longer sides, without EXIF
 FILM = 36.0  # mm, the longer side of the frame that 35 mm equivalents refer to
 STRAY = 3.0  # pixels of the pictures that photos are reduced to
 FLATTEST = 1.5  # degrees between the rays of a point: COLMAP's own
+# degrees between the rays of the pair that mapping begins with: COLMAP's own, and of photos taken
+# side by side
+FIRST_ANGLES = 16.0, 4.0
 # distortion terms of camera models
 LENSES = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "OPENCV": 4, "OPENCV_FISHEYE": 4}
 
@@ -182,22 +185,38 @@ def _joined(
 def _models(
     job: Job, n_photos: int, pictures: Path, database: Path, settings: PoseSection
 ) -> list[pycolmap.Reconstruction]:
-    """The models that mapping finds by a database, largest first."""
+    """The models that mapping finds by a database, largest first.
+
+    Choices: where fewer than HALF of the photos register, it begins again with a pair nearer to
+      each other. Handheld views of one thing from the front may all lie within 16°, so that none
+      of their pairs is a beginning.
+    """
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, settings.seed
     out = job.scratch / "mapped"
     out.mkdir(exist_ok=True)
-    with job.progress.ticker(n_photos, "poses") as registered:
+    best: list[pycolmap.Reconstruction] = []
+    for options.mapper.init_min_tri_angle in FIRST_ANGLES:
+        with job.progress.ticker(n_photos, "poses") as registered:
 
-        def first_pair() -> None:
-            registered()
-            registered()
+            def first_pair(registered: Callable[[], None] = registered) -> None:
+                registered()
+                registered()
 
-        models = pycolmap.incremental_mapping(
-            database, pictures, out, options,
-            initial_image_pair_callback=first_pair, next_image_callback=registered,
-        )  # fmt: skip
-    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
+            models = pycolmap.incremental_mapping(
+                database, pictures, out, options,
+                initial_image_pair_callback=first_pair, next_image_callback=registered,
+            )  # fmt: skip
+        found = sorted(models.values(), key=_n_registered, reverse=True)
+        if found and (not best or _n_registered(found[0]) > _n_registered(best[0])):
+            best = found
+        if best and _n_registered(best[0]) >= HALF * n_photos:
+            break
+    return best
+
+
+def _n_registered(model: pycolmap.Reconstruction) -> int:
+    return int(model.num_reg_images())
 
 
 def _free_second_term(model: pycolmap.Reconstruction) -> None:

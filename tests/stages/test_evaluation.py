@@ -20,7 +20,13 @@ from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.work import summary
 from chebsplat.render import SceneRenderer, frame_parts
 from chebsplat.stages.evaluate import camera
-from chebsplat.stages.measuring.image_quality import enlarged, image_figures, load_lpips
+from chebsplat.stages.measuring.image_quality import (
+    enlarged,
+    figures_where_shown,
+    image_figures,
+    load_lpips,
+    shown_pixels,
+)
 from chebsplat.stages.report import summary_rows
 from chebsplat.stages.sources import generated
 from tests.stages.test_stages import changed, inputs_of
@@ -128,6 +134,28 @@ def test_what_is_masked_counts_in_no_image_figure_and_no_lpips_is_none(weights):
     assert image_figures(renders, truth, masks)["lpips"] is None
 
 
+def test_pixels_that_a_training_photo_shows_are_told_by_depth():
+    # a wall two units before four cameras: itself, one that shifts it by two of its four columns,
+    # one behind which it lies, and one before which something stands
+    wall = np.full((4, 2, 4), 2.0, np.float32)
+    wall[3] = 1.0
+    wall[0, 0, 3] = np.nan
+    Ks = np.tile(np.array([[2.0, 0, 2], [0, 2.0, 1], [0, 0, 1]]), (4, 1, 1))
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[1, 0, 3] = 2.0
+    poses[2, :3, :3] = np.diag([-1, 1, -1])
+    (shown,) = shown_pixels([0], [1], wall, Ks, poses)
+    assert (shown == [[True, True, False, False]] * 2).all()
+    assert not shown_pixels([0], [2, 3, 0], wall, Ks, poses)[0].any()
+    (shown,) = shown_pixels([0], [1, 2, 3], wall, Ks, poses)
+    truth = pictures(1)[:, :2, :4]
+    render = truth.copy()
+    render[0, :, 2:] = 255 - render[0, :, 2:]  # wrong where nothing was seen
+    found = figures_where_shown(render, truth, [shown])
+    assert found == {"psnr": 100.0, "share": 0.5, "per_view": {"psnr": [100.0]}}
+    assert figures_where_shown(render, truth, [np.zeros_like(shown)]) is None
+
+
 @pytest.mark.xdist_group("toy")
 def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_undistorted_photos_are_named(
     toy, tmp_path
@@ -144,6 +172,9 @@ def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_undistorted_pho
     n = len(whole["names"])
     assert "no pixel" in found["left_out"][f"1 of {n} views"]
     assert "as_taken" not in found["image"]  # its capture holds none
+    where_shown = whole["image"]["where_shown"]
+    assert 0.5 < where_shown["share"] <= 1 and where_shown["psnr"] > 0
+    assert found["image"]["where_shown"]["per_view"]["psnr"] == where_shown["per_view"]["psnr"][1:]
     timed = {"evaluation": "A", "gaussians": "B"}
     rows = [
         summary_rows(figures, None, {"milliseconds": {}}, timed)[0].name

@@ -98,6 +98,34 @@ def test_pairs_are_doubted_that_join_two_parts_which_most_pairs_hold_apart(found
     assert judge.joint(found) == [(100 + i, 100 + j) for i, j in joining]
 
 
+def write_features(folder, features, camera=""):
+    """A database of photos of 800x600 pixels with `features`, {point: pixel} of each, matched.
+
+    Args: camera: parameters of their lens; "": a guess.
+    """
+    files = [file_of(photo) for photo in range(len(features))]
+    for file in files:
+        Image.new("RGB", (800, 600)).save(folder / file)
+    database = empty_database(folder / "database.db")
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model, reader.camera_params = "SIMPLE_RADIAL", camera
+    pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, files, reader)
+    with pycolmap.Database.open(database) as opened:
+        ids = [opened.read_image_with_name(file).image_id for file in files]
+        for photo, pixels in enumerate(features):
+            opened.write_keypoints(ids[photo], np.array(list(pixels.values()), np.float32))
+        for i, j in all_pairs(len(files)):
+            _, rows, others = np.intersect1d(
+                list(features[i]), list(features[j]), return_indices=True
+            )
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
+            geometry.inlier_matches = np.stack([rows, others], 1).astype(np.uint32)
+            if len(rows):
+                opened.write_two_view_geometry(ids[i], ids[j], geometry)
+    return database
+
+
 def two_parts(folder, repeats):
     """Shots of two parts of a room, twelve photos each, their poses [24, 4, 4], and a database of
     features and matches. Seven photos of each part see 40 points between the parts. Where something
@@ -124,27 +152,8 @@ def two_parts(folder, repeats):
             local = points @ poses[photo, :3, :3].T + poses[photo, :3, 3]
             pixels = 400 * local[:, :2] / local[:, 2:] + [400, 300]
             features[photo] |= dict(enumerate(pixels + rng.normal(0, 0.2, pixels.shape), first))
-    files = [file_of(photo) for photo in range(24)]
-    for file in files:
-        Image.new("RGB", (800, 600)).save(folder / file)
-    database = empty_database(folder / "database.db")
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model, reader.camera_params = "SIMPLE_RADIAL", "400,400,300,0"
-    pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, files, reader)
-    with pycolmap.Database.open(database) as opened:
-        ids = [opened.read_image_with_name(file).image_id for file in files]
-        for photo, pixels in enumerate(features):
-            opened.write_keypoints(ids[photo], np.array(list(pixels.values()), np.float32))
-        for i, j in all_pairs(24):
-            _, rows, others = np.intersect1d(
-                list(features[i]), list(features[j]), return_indices=True
-            )
-            geometry = pycolmap.TwoViewGeometry()
-            geometry.config = pycolmap.TwoViewGeometryConfiguration.UNCALIBRATED
-            geometry.inlier_matches = np.stack([rows, others], 1).astype(np.uint32)
-            if len(rows):
-                opened.write_two_view_geometry(ids[i], ids[j], geometry)
-    return [Shot(file, folder / file, (800, 600)) for file in files], poses, database
+    database = write_features(folder, features, "400,400,300,0")
+    return [Shot(file_of(k), folder / file_of(k), (800, 600)) for k in range(24)], poses, database
 
 
 @pytest.mark.parametrize("repeats", [True, False])
@@ -160,6 +169,27 @@ def test_parts_that_what_repeats_has_joined_are_joined_by_what_they_share(
     scale, rotation, shift = alignment(model.cam_from_world, poses)
     found = scale * centers(model.cam_from_world) @ rotation.T + shift
     assert np.abs(found - centers(poses)).max() < 0.02  # metres where noise is .2 pixels
+
+
+def test_photos_taken_side_by_side_without_a_focal_length_register(tmp_path):
+    rng, poses = np.random.default_rng(0), np.tile(np.eye(4), (12, 1, 1))
+    grid = np.stack(np.meshgrid(np.arange(4) - 1.5, np.arange(3) - 1.0), -1).reshape(-1, 2)
+    turns = Rotation.from_euler("xyz", rng.uniform(-1, 1, (12, 3)), degrees=True)
+    poses[:, :3, :3] = turns.as_matrix()
+    poses[:, :3, 3] = -turns.apply(np.pad(0.1 * grid, ((0, 0), (0, 1))))  # all within 4 degrees
+    points = rng.uniform([-3, -2, 4], [3, 2, 9], (400, 3))
+    features = []
+    for pose in poses:
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        pixels = 560 * local[:, :2] / local[:, 2:] + [400, 300] + rng.normal(0, 0.2, (400, 2))
+        inside = ((pixels > 0) & (pixels < [800, 600])).all(1)
+        features.append({point: pixels[point] for point in np.flatnonzero(inside)})
+    database = write_features(tmp_path, features)
+    job = Job({}, Config(), tmp_path / "out", tmp_path)
+    model = posing._models(job, 12, tmp_path, database, PoseSection())[0]
+    assert model.num_reg_images() == 12
+    (camera,) = model.cameras.values()
+    assert camera.mean_focal_length() == pytest.approx(560, rel=0.02)
 
 
 @pytest.mark.parametrize(
