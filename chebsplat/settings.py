@@ -20,7 +20,6 @@ PRINTED: dict[str, Any] = {  # train settings that `train.method = "printed"` de
     "feature_loss": "l1",
     "densify": "region",
     "sh_freeze": 1.0,
-    "sh_guided": False,
     "sh_degree": 3,
     "exposure": "off",
     "lr_sh_masks": 5e-2,
@@ -144,9 +143,6 @@ class TrainSection(Section):
         1e-4, "gradient to the 2D means that grows a Gaussian, half image widths", 1e-12, 1e3
     )
     sh_prune: bool = setting(True, "close SH bands that add nothing")
-    sh_guided: bool = setting(
-        True, "false: nothing but a Gaussian's own logits closes its SH bands"
-    )
     # photos
     exposure: Literal["auto", "measured", "off"] = setting(
         "auto", "of photos; measured: what one has alone is undone; auto: where they differ"

@@ -29,12 +29,11 @@ from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import lacking
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.measuring.image_quality import (
+    covisible_figures,
     figures_as_taken,
-    figures_where_shown,
     frame_split,
     image_figures,
     load_lpips,
-    shown_pixels,
     timing,
 )
 from chebsplat.stages.runtime.command import Job
@@ -108,16 +107,10 @@ def run(job: Job) -> None:
     as_taken = figures_as_taken(capture, renderer, dict(zip(names, cameras, strict=True)))
     if as_taken is not None:
         figures["image"]["as_taken"] = as_taken
-    if capture.depth is not None and capture.cam_from_world is not None:
-        tested, training = [row[name] for name in names], np.flatnonzero(~capture.is_test)
-        shown = shown_pixels(
-            tested, training.tolist(), capture.depth, capture.Ks, capture.cam_from_world
-        )
-        if masks is not None:
-            shown = [a & b for a, b in zip(shown, masks, strict=True)]
-        figures["image"]["where_shown"] = figures_where_shown(
-            pictures["renders"], pictures["truth"], shown
-        )
+    if not protocol.RULE.on_training:
+        covisible = covisible_figures(capture, scene.cameras, names, pictures["renders"])
+        if covisible is not None:
+            figures["image"]["covisible"] = covisible
     if segmentation is not None:
         figures["segmentation"] = segmentation
     figures["left_out"] = scene.summary.get("left_out", {}) | job.facts.get("left_out", {})

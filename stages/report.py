@@ -248,7 +248,7 @@ def summary_rows(
         Figure(f"PSNR, dB (8-bit, mean over views{of})", image["psnr"], form="{:.2f}"),
         Figure("PSNR after a colour fit by view, dB", image.get("psnr_fit"), form="{:.2f}"),
         *taken_rows(image.get("as_taken")),
-        *shown_rows(image.get("where_shown")),
+        *covisible_rows(image.get("covisible")),
         Figure("SSIM (window 11, σ 1.5)", image["ssim"], form="{:.4f}"),
         Figure("LPIPS (vgg, images in [0, 1])", figures["lpips"], form="{:.3f}"),
     ]
@@ -319,14 +319,12 @@ def taken_rows(figures: dict[str, Any] | None) -> list[Figure]:
     ]
 
 
-def shown_rows(figures: dict[str, Any] | None) -> list[Figure]:
-    """PSNR of the test pixels that training photos show; nothing where depth cannot tell."""
+def covisible_rows(figures: dict[str, Any] | None) -> list[Figure]:
+    """PSNR of co-visible test pixels; nothing where no depth tells of them."""
     if figures is None:
         return []
-    share = f"{figures['share']:.0%} of the pixels"
-    return [
-        Figure(f"PSNR where training photos looked, {share}, dB", figures["psnr"], form="{:.2f}")
-    ]
+    of = f"co-visible pixels ({figures['share']:.0%} of those with depth)"
+    return [Figure(f"PSNR of {of}, dB", figures["psnr"], form="{:.2f}")]
 
 
 def refined_rows(facts: dict[str, Any] | None) -> list[Figure]:

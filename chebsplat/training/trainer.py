@@ -55,7 +55,6 @@ class Trainer:
         assert settings.feature_every is not None and settings.weight_depth is not None
         self.feature_every, self.weight_depth = settings.feature_every, settings.weight_depth
         self.members = torch.zeros(0, 0, dtype=torch.int64)
-        self.guidance: Tensor | None = None
         self.optimizer = optimizer_of(self.model, self.settings, self.extent)
         self.order_generator = np.random.default_rng(settings.seed)
         self.generator = torch.Generator().manual_seed(settings.seed)
@@ -158,7 +157,7 @@ class Trainer:
             "generator": self.generator.get_state(),
             "population": self.population.state_dict(),
             "progress": (self.step, self.seconds, self.order),
-            "guides": (self.members, self.guidance),
+            "members": self.members,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -172,7 +171,7 @@ class Trainer:
         self.order_generator.bit_generator.state = state["order_generator"]
         self.generator.set_state(state["generator"])
         self.step, self.seconds, self.order = state["progress"]
-        self.members, self.guidance = state["guides"]
+        self.members = state["members"]
         self.population.load_state_dict(state["population"])
 
     def refresh(self) -> None:
@@ -181,25 +180,9 @@ class Trainer:
         if not isinstance(self.model, PrintedScene):  # which has regions of its own at each step
             means = self.model.raw["means"].detach().double().cpu().numpy()
             regions = regions_of(means, self.model.describe)
-            self.members, self.guidance = (
-                torch.as_tensor(regions.members).to(self.model.device),
-                None,
-            )
+            self.members = torch.as_tensor(regions.members).to(self.model.device)
         self.population.note_distances()
         self.laps.mark("refresh")
-
-    def _guided(self, index: Tensor | None) -> Tensor | None:
-        """Weights [V, 3] of the bands' penalty, computed on demand; None: all alike."""
-        if not self.settings.sh_guided:
-            return None
-        if self.guidance is None:
-            self.laps.mark("losses")
-            shN = sh_prune.dense(
-                [band.detach() for band in self.model.bands()[1:]], len(self.model)
-            )
-            self.guidance = sh_prune.region_guidance(shN, self.members, len(self.model))
-            self.laps.mark("refresh")
-        return self.guidance if index is None else self.guidance[index]
 
     def _step(self, index: int, share: float) -> dict[str, float | Tensor]:
         settings = self.settings
@@ -278,14 +261,12 @@ class Trainer:
         self.laps.mark("render")
         auxiliary, (photo, mask) = rendered.auxiliary, self.views.photo(index, window)
         labels = None if target is None or self.views.labels is None else self.views.labels(index)
-        guidance = None if auxiliary.band_masks is None else self._guided(rendered.index)
         optional = {
             "photo": photo, "mask": mask, "rgb": rendered.rgb, "target": target,
             "features": rendered.features, "surface": surface, "planes": rendered.planes,
             "alpha": None if rendered.planes is None else rendered.alpha,
             "classes": labels and labels.classes, "confidence": labels and labels.confidence,
-            "class_codes": labels and labels.class_codes, "guidance": guidance,
-            "soft_mask": auxiliary.soft_mask,
+            "class_codes": labels and labels.class_codes, "soft_mask": auxiliary.soft_mask,
             "band_masks": auxiliary.band_masks, "in_view": auxiliary.in_view,
             "delta": auxiliary.delta, "knowledge": auxiliary.knowledge,
         }  # fmt: skip
@@ -324,9 +305,7 @@ class Trainer:
                     inputs["soft_mask"], inputs.get("in_view")
                 )
             if "band_masks" in inputs:
-                cost = sh_prune.sh_loss(
-                    inputs["band_masks"], inputs.get("guidance"), inputs.get("in_view")
-                )
+                cost = sh_prune.sh_loss(inputs["band_masks"], inputs.get("in_view"))
                 losses["sh"] = settings.weight_sh * cost
         if "planes" in inputs:
             distance = depth_distance(

@@ -20,7 +20,7 @@ from chebsplat.pipelines.work import store
 
 RUNS, FAILED, WAITS, LEFT, DONE = "runs", "failed", "waits", "not begun", "done"
 LINES = 5  # of a failed step's log
-NEARLY_ALL = 0.95  # of the test pixels: training photos that show as many show the scene
+NEARLY_ALL = 0.95  # of the test pixels: where training photos show more, PSNR is of the scene
 
 
 def figures(evaluation: Path) -> Any:
@@ -69,7 +69,7 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
         miou, beside = "none", [measured["left_out"].get("mIoU", "")]
     rows = [
         ("test PSNR", psnr, text("SSIM {:.3f}", number(measured, "image", "ssim"))),
-        ("where photos looked", *where_shown(measured)),
+        ("co-visible PSNR", *covisible(measured)),
         (
             "as taken",
             text("{:.1f} dB", number(measured, "image", "as_taken", "psnr")),
@@ -88,14 +88,14 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
     return [row for row in rows if row[1]]
 
 
-def where_shown(figures: Any) -> tuple[str, str]:
-    """PSNR of the test pixels that training photos show, and their share; empty where these are
-    nearly all, or depth cannot tell.
+def covisible(figures: Any) -> tuple[str, str]:
+    """PSNR of the test pixels whose surface a training photo shows, and their share; empty where
+    these are nearly all, or no depth tells.
     """
-    shown = (figures or {}).get("image", {}).get("where_shown")
-    if not shown or shown["share"] > NEARLY_ALL:
+    found = (figures or {}).get("image", {}).get("covisible")
+    if not found or found["share"] > NEARLY_ALL:
         return "", ""
-    return f"{shown['psnr']:.1f} dB", f"{shown['share']:.0%} of the test pixels"
+    return f"{found['psnr']:.1f} dB", f"of the {found['share']:.0%} that training photos show"
 
 
 def as_taken(figures: Any) -> str:

@@ -20,15 +20,16 @@ from chebsplat.cameras import unproject
 from chebsplat.errors import InputError
 from chebsplat.evaluation.lpips import Lpips
 from chebsplat.evaluation.metrics import color_fitted, psnr
+from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
-from chebsplat.formats.record import Stack
 from chebsplat.kernels.threads import n_threads
+from chebsplat.labels.agreement import project, unhidden
 from chebsplat.render import PARTS, SceneRenderer, focals, frame_parts
 from chebsplat.training.losses import ssim
 from chebsplat.views import View
 
 LEAST_SIDE = 16  # pixels, of LPIPS
-SAME_SURFACE = 0.05  # of a depth: two views that differ by less show the same surface
+COVISIBLE_SIDE = 160  # pixels of the longer side of the grid that co-visibility is told on
 
 
 def image_figures(
@@ -58,55 +59,52 @@ def image_figures(
     return {"lpips": None} | means | {"per_view": per_view}
 
 
-def figures_where_shown(
-    renders: np.ndarray, truth: np.ndarray, shown: list[np.ndarray]
-) -> dict[str, Any] | None:
-    """PSNR, dB, of the pixels that training photos show, `shown` bool [H, W] of each view, and
-    their `share`; None where they show none of any.
+def covisible_figures(
+    capture: Capture, cameras: Cameras, names: Sequence[str], renders: np.ndarray
+) -> dict[str, float] | None:
+    """PSNR, dB, of the test views' co-visible pixels, whose surface a training photo shows, and
+    their `share` of the pixels with measured depth; None where depth tells of none.
+
+    Args: cameras: of the scene; names: of the test views; renders: u8 [T, H, W, 3] of them.
+    Choices: on a grid of up to COVISIBLE_SIDE pixels a side, all views together. Masked pixels do
+      not count, nor do they show anything.
     """
-    psnrs = [
-        min(psnr(render[pixels], true[pixels]), 100.0) if pixels.any() else None
-        for render, true, pixels in zip(renders, truth, shown, strict=True)
-    ]
-    counted = [value for value in psnrs if value is not None]
-    if not counted:
+    if capture.depth is None or capture.cam_from_world is None:
         return None
-    share = float(np.mean([pixels.mean() for pixels in shown]))
-    return {"psnr": float(np.mean(counted)), "share": share, "per_view": {"psnr": psnrs}}
+    row = {name: view for view, name in enumerate(capture.names)}
+    place = {name: k for k, name in enumerate(cameras.names)}
+    step, parts = -(-max(capture.size) // COVISIBLE_SIDE), []
+    for name, render in zip(names, renders, strict=True):
+        depth, K, pose = _posed_depth(capture, row[name], cameras, place[name])
+        pixels = np.argwhere(np.isfinite(depth[::step, ::step])) * step
+        rows, columns = pixels.T
+        true = capture.images[row[name]][rows, columns]
+        parts.append((unproject(depth, K, pose, pixels), render[rows, columns], true))
+    points, rendered, true = (np.concatenate(part) for part in zip(*parts, strict=True))
+    covisible = np.zeros(len(points), bool)
+    for name in cameras.names:
+        if name in row and not capture.is_test[row[name]]:
+            depth, K, pose = _posed_depth(capture, row[name], cameras, place[name])
+            left = ~covisible
+            covisible[left] = unhidden(
+                project(points[left], K, pose, capture.size), capture.size, depth
+            )
+    if not covisible.any():
+        return None
+    psnr_covisible = min(psnr(rendered[covisible], true[covisible]), 100.0)
+    return {"psnr": psnr_covisible, "share": float(covisible.mean())}
 
 
-def shown_pixels(
-    views: Sequence[int],
-    others: Sequence[int],
-    depth: Stack,
-    Ks: np.ndarray,
-    cam_from_world: np.ndarray,
-) -> list[np.ndarray]:
-    """Pixels bool [H, W] of each view whose surface one of the `others` shows, by measured depth.
-
-    Args: depth: f32 [V, H, W] z, scene units, nan where unknown: such pixels are not shown; Ks
-      [V, 3, 3]; cam_from_world [V, 4, 4].
-    """
-    shown, left = [np.zeros(depth.shape[1:], bool) for _ in views], {}
-    for view in views:
-        own = depth[view]
-        pixels = np.argwhere(own > 0)
-        left[view] = pixels, unproject(own, Ks[view], cam_from_world[view], pixels)
-    for other in others:
-        pose, there = cam_from_world[other], depth[other]
-        for view, mask in zip(views, shown, strict=True):
-            if view == other or not len(left[view][0]):
-                continue
-            pixels, world = left[view]
-            projected = (world @ pose[:3, :3].T + pose[:3, 3]) @ Ks[other].T
-            z = np.where(projected[:, 2] > 0, projected[:, 2], np.nan)
-            places = np.floor(projected[:, 1::-1] / z[:, None])
-            found = ((places >= 0) & (places < there.shape)).all(1)  # nan is neither
-            rows, columns = places[found].astype(int).T
-            found[found] = np.abs(there[rows, columns] / z[found] - 1) < SAME_SURFACE
-            mask[tuple(pixels[found].T)] = True
-            left[view] = pixels[~found], world[~found]
-    return shown
+def _posed_depth(
+    capture: Capture, view: int, cameras: Cameras, place: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Measured depth [H, W] of a view, nan where unknown or masked, its K and cam_from_world."""
+    assert capture.depth is not None
+    depth = np.where(capture.depth[view] > 0, capture.depth[view], np.nan)
+    depth[~np.isfinite(depth)] = np.nan
+    if capture.loss_mask is not None:
+        depth[~capture.loss_mask[view]] = np.nan
+    return depth, cameras.Ks[place], cameras.cam_from_world[place]
 
 
 def figures_as_taken(

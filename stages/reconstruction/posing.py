@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from pathlib import Path
 from typing import Any
@@ -38,9 +38,8 @@ WIDE = 0.5  # a fisheye's focal length in longer sides, without EXIF
 FILM = 36.0  # mm, the longer side of the frame that 35 mm equivalents refer to
 STRAY = 3.0  # pixels of the pictures that photos are reduced to
 FLATTEST = 1.5  # degrees between the rays of a point: COLMAP's own
-# degrees between the rays of the pair that mapping begins with: COLMAP's own, and of photos taken
-# side by side
-FIRST_ANGLES = 16.0, 4.0
+# degrees between the rays of the pair that mapping begins with: COLMAP's own, and where it fails
+INIT_ANGLES = 16.0, 2.0
 # distortion terms of camera models
 LENSES = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "OPENCV": 4, "OPENCV_FISHEYE": 4}
 
@@ -187,36 +186,53 @@ def _models(
 ) -> list[pycolmap.Reconstruction]:
     """The models that mapping finds by a database, largest first.
 
-    Choices: where fewer than HALF of the photos register, it begins again with a pair nearer to
-      each other. Handheld views of one thing from the front may all lie within 16°, so that none
-      of their pairs is a beginning.
+    Choices: where fewer than HALF of the photos register, it begins again with a smaller angle
+      between the rays of its first pair, which counts where MORE times as many register. COLMAP
+      itself goes down to a quarter of an angle. Handheld photos of one side of a thing may lie
+      nearer to each other, and their widest pairs still share too little.
     """
-    options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads, options.random_seed = 1, settings.seed
-    out = job.scratch / "mapped"
-    out.mkdir(exist_ok=True)
     best: list[pycolmap.Reconstruction] = []
-    for options.mapper.init_min_tri_angle in FIRST_ANGLES:
-        with job.progress.ticker(n_photos, "poses") as registered:
-
-            def first_pair(registered: Callable[[], None] = registered) -> None:
-                registered()
-                registered()
-
-            models = pycolmap.incremental_mapping(
-                database, pictures, out, options,
-                initial_image_pair_callback=first_pair, next_image_callback=registered,
-            )  # fmt: skip
-        found = sorted(models.values(), key=_n_registered, reverse=True)
-        if found and (not best or _n_registered(found[0]) > _n_registered(best[0])):
-            best = found
-        if best and _n_registered(best[0]) >= HALF * n_photos:
+    for angle in INIT_ANGLES:
+        n_registered = best[0].num_reg_images() if best else 0
+        if n_registered >= HALF * n_photos:
             break
+        if angle != INIT_ANGLES[0]:
+            log.info(
+                "%d of %d photos registered; mapping again, from pairs of a smaller angle",
+                n_registered,
+                n_photos,
+            )
+        tried = _models_from(angle, job, n_photos, pictures, database, settings)
+        if tried and tried[0].num_reg_images() > MORE * n_registered:
+            best = tried
     return best
 
 
-def _n_registered(model: pycolmap.Reconstruction) -> int:
-    return int(model.num_reg_images())
+def _models_from(
+    init_angle: float,
+    job: Job,
+    n_photos: int,
+    pictures: Path,
+    database: Path,
+    settings: PoseSection,
+) -> list[pycolmap.Reconstruction]:
+    """As `_models`, beginning with pairs of such an angle, degrees."""
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads, options.random_seed = 1, settings.seed
+    options.mapper.init_min_tri_angle = init_angle
+    out = job.scratch / "mapped"
+    out.mkdir(exist_ok=True)
+    with job.progress.ticker(n_photos, "poses") as registered:
+
+        def first_pair() -> None:
+            registered()
+            registered()
+
+        models = pycolmap.incremental_mapping(
+            database, pictures, out, options,
+            initial_image_pair_callback=first_pair, next_image_callback=registered,
+        )  # fmt: skip
+    return sorted(models.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
 
 def _free_second_term(model: pycolmap.Reconstruction) -> None:

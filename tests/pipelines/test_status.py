@@ -16,7 +16,7 @@ from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.running import cluster, job
 from chebsplat.pipelines.running.run import entry, plan_of
 from chebsplat.pipelines.work import store
-from chebsplat.pipelines.work.summary import as_taken, table, where_shown
+from chebsplat.pipelines.work.summary import as_taken, covisible, table
 
 pytestmark = pytest.mark.usefixtures("quick_plans")
 
@@ -140,15 +140,17 @@ def test_frames_a_second_of_a_finished_scene_name_the_machine_that_rendered_them
     assert manifest.processes[0]["processor"] in beside["frames/s"]
 
 
-def test_pixels_that_photos_show_are_told_of_where_they_are_not_nearly_all():
-    shown = {"psnr": 22.04, "share": 0.61}
-    assert where_shown({"image": {"where_shown": shown}}) == ("22.0 dB", "61% of the test pixels")
-    for figures in (
-        None,
-        {"image": {"where_shown": None}},
-        {"image": {"where_shown": shown | {"share": 0.99}}},
-    ):
-        assert where_shown(figures) == ("", "")
+@pytest.mark.parametrize(
+    ("found", "told"),
+    [
+        ({"psnr": 22.04, "share": 0.61}, ("22.0 dB", "of the 61% that training photos show")),
+        ({"psnr": 22.04, "share": 0.951}, ("", "")),
+        (None, ("", "")),
+    ],
+)  # fmt: skip
+def test_covisible_pixels_are_told_of_where_they_are_not_nearly_all(found, told):
+    assert covisible({"image": {"covisible": found} if found else {}}) == told
+    assert covisible(None) == ("", "")
 
 
 def test_photos_as_taken_are_told_of_with_their_size():

@@ -12,6 +12,7 @@ from chebsplat.errors import InputError
 from chebsplat.evaluation.lpips import BLOCKS, SCALE, SHIFT, Lpips
 from chebsplat.evaluation.protocols import scannet_closed, scannet_open
 from chebsplat.formats import artifact
+from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.features import Features
@@ -21,11 +22,10 @@ from chebsplat.pipelines.work import summary
 from chebsplat.render import SceneRenderer, frame_parts
 from chebsplat.stages.evaluate import camera
 from chebsplat.stages.measuring.image_quality import (
+    covisible_figures,
     enlarged,
-    figures_where_shown,
     image_figures,
     load_lpips,
-    shown_pixels,
 )
 from chebsplat.stages.report import summary_rows
 from chebsplat.stages.sources import generated
@@ -134,26 +134,50 @@ def test_what_is_masked_counts_in_no_image_figure_and_no_lpips_is_none(weights):
     assert image_figures(renders, truth, masks)["lpips"] is None
 
 
-def test_pixels_that_a_training_photo_shows_are_told_by_depth():
-    # a wall two units before four cameras: itself, one that shifts it by two of its four columns,
-    # one behind which it lies, and one before which something stands
-    wall = np.full((4, 2, 4), 2.0, np.float32)
-    wall[3] = 1.0
-    wall[0, 0, 3] = np.nan
-    Ks = np.tile(np.array([[2.0, 0, 2], [0, 2.0, 1], [0, 0, 1]]), (4, 1, 1))
+def wall_capture(**fields):
+    """A wall two units before four cameras of 4x2 pixels: a test view; one that sees half of it,
+    two of its columns further; one that looks away; one before which something stands.
+    """
+    depth = np.full((4, 2, 4), 2.0, np.float32)
+    depth[3] = 1.0
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[1, 0, 3] = 2.0
     poses[2, :3, :3] = np.diag([-1, 1, -1])
-    (shown,) = shown_pixels([0], [1], wall, Ks, poses)
-    assert (shown == [[True, True, False, False]] * 2).all()
-    assert not shown_pixels([0], [2, 3, 0], wall, Ks, poses)[0].any()
-    (shown,) = shown_pixels([0], [1, 2, 3], wall, Ks, poses)
-    truth = pictures(1)[:, :2, :4]
-    render = truth.copy()
-    render[0, :, 2:] = 255 - render[0, :, 2:]  # wrong where nothing was seen
-    found = figures_where_shown(render, truth, [shown])
-    assert found == {"psnr": 100.0, "share": 0.5, "per_view": {"psnr": [100.0]}}
-    assert figures_where_shown(render, truth, [np.zeros_like(shown)]) is None
+    fields = {"depth": depth, "cam_from_world": poses, "loss_mask": None} | fields
+    Ks = np.tile(np.array([[2.0, 0, 2], [0, 2.0, 1], [0, 0, 1]]), (4, 1, 1))
+    is_test, images = np.arange(4) == 0, np.tile(pictures(1)[:, :2, :4], (4, 1, 1, 1))
+    names = ["test", "half", "away", "behind"]
+    return Capture(names, images, Ks, is_test=is_test, **fields)
+
+
+def covisible_of(capture, views=(0, 1, 2, 3), poses=None):
+    """Figures of a render that is wrong in the right half, by the cameras of some views."""
+    render = capture.images[:1].copy()
+    render[0, :, 2:] = 255 - render[0, :, 2:]
+    rows = list(views)
+    poses = wall_capture().cam_from_world if poses is None else poses
+    cameras = Cameras([capture.names[k] for k in rows], capture.Ks[rows], poses[rows], 4, 2)
+    return covisible_figures(capture, cameras, ["test"], render)
+
+
+def test_covisible_pixels_are_those_whose_surface_a_training_photo_shows():
+    wall = wall_capture()
+    assert covisible_of(wall) == {"psnr": 100.0, "share": 0.5}
+    assert covisible_of(wall, views=(0, 2, 3)) is None  # what no camera of the scene shows
+    assert covisible_of(wall, poses=np.tile(np.eye(4), (4, 1, 1)))["share"] == 1.0
+    assert covisible_of(wall_capture(depth=None)) is None
+    assert covisible_of(wall_capture(cam_from_world=None)) is None
+
+
+def test_covisible_pixels_are_counted_among_those_of_known_depth_that_no_mask_hides():
+    depth = wall_capture().depth.copy()
+    depth[0, :, 3], depth[0, 0, 2] = np.nan, np.inf
+    assert covisible_of(wall_capture(depth=depth))["share"] == pytest.approx(4 / 5)
+    mask = np.ones((4, 2, 4), bool)
+    mask[0, :, 2:] = False
+    assert covisible_of(wall_capture(loss_mask=mask))["share"] == 1.0
+    mask[1] = False  # a training photo shows nothing where it is masked
+    assert covisible_of(wall_capture(loss_mask=mask)) is None
 
 
 @pytest.mark.xdist_group("toy")
@@ -172,9 +196,8 @@ def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_undistorted_pho
     n = len(whole["names"])
     assert "no pixel" in found["left_out"][f"1 of {n} views"]
     assert "as_taken" not in found["image"]  # its capture holds none
-    where_shown = whole["image"]["where_shown"]
-    assert 0.5 < where_shown["share"] <= 1 and where_shown["psnr"] > 0
-    assert found["image"]["where_shown"]["per_view"]["psnr"] == where_shown["per_view"]["psnr"][1:]
+    assert 0.5 < whole["image"]["covisible"]["share"] <= 1
+    assert whole["image"]["covisible"]["psnr"] > 0
     timed = {"evaluation": "A", "gaussians": "B"}
     rows = [
         summary_rows(figures, None, {"milliseconds": {}}, timed)[0].name

@@ -176,15 +176,6 @@ def test_a_resumed_training_takes_the_same_steps_to_the_bit(tmp_path, chosen):
             assert np.array_equal(value, parameters[name]), name
 
 
-def test_the_bands_guidance_is_found_when_wanted_and_anew_after_a_refresh():
-    made = tiny_trainer(steps=20, prune_from=0.5, densify="off", refresh_every=1000)
-    found = [made.guidance for _ in made.steps() if made.step < 14]
-    assert all(weights is None for weights in found[:9]) and found[9].shape == (len(made.model), 3)
-    assert all(weights is found[9] for weights in found[10:])
-    made.refresh()
-    assert made.guidance is None
-
-
 def test_a_picture_without_features_has_the_colours_of_one_with_them():
     made = tiny_trainer()
     pictures = [made.model.render(made.views.camera(0, 1), 3, semantic=k) for k in (True, False)]

@@ -171,12 +171,12 @@ def test_parts_that_what_repeats_has_joined_are_joined_by_what_they_share(
     assert np.abs(found - centers(poses)).max() < 0.02  # metres where noise is .2 pixels
 
 
-def test_photos_taken_side_by_side_without_a_focal_length_register(tmp_path):
+def test_photos_taken_side_by_side_without_a_focal_length_register(tmp_path, caplog):
     rng, poses = np.random.default_rng(0), np.tile(np.eye(4), (12, 1, 1))
     grid = np.stack(np.meshgrid(np.arange(4) - 1.5, np.arange(3) - 1.0), -1).reshape(-1, 2)
     turns = Rotation.from_euler("xyz", rng.uniform(-1, 1, (12, 3)), degrees=True)
     poses[:, :3, :3] = turns.as_matrix()
-    poses[:, :3, 3] = -turns.apply(np.pad(0.1 * grid, ((0, 0), (0, 1))))  # all within 4 degrees
+    poses[:, :3, 3] = -turns.apply(np.pad(0.1 * grid, ((0, 0), (0, 1))))  # 4 to 9 away
     points = rng.uniform([-3, -2, 4], [3, 2, 9], (400, 3))
     features = []
     for pose in poses:
@@ -186,10 +186,44 @@ def test_photos_taken_side_by_side_without_a_focal_length_register(tmp_path):
         features.append({point: pixels[point] for point in np.flatnonzero(inside)})
     database = write_features(tmp_path, features)
     job = Job({}, Config(), tmp_path / "out", tmp_path)
-    model = posing._models(job, 12, tmp_path, database, PoseSection())[0]
+    usual = posing._models_from(16.0, job, 12, tmp_path, database, PoseSection())
+    assert not usual or usual[0].num_reg_images() < 6
+    with caplog.at_level("INFO", "chebsplat"):
+        model = posing._models(job, 12, tmp_path, database, PoseSection())[0]
+    assert "mapping again, from pairs of a smaller angle" in caplog.text
     assert model.num_reg_images() == 12
     (camera,) = model.cameras.values()
     assert camera.mean_focal_length() == pytest.approx(560, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("counts", "angles", "kept"),
+    [
+        ([[6]], [16.0], 6),
+        ([[5], [12]], [16.0, 2.0], 12),
+        ([[5, 3], [5]], [16.0, 2.0], 5),
+        ([[], [2]], [16.0, 2.0], 2),
+    ],
+)
+def test_mapping_begins_again_where_few_register_and_counts_where_more_do(
+    monkeypatch, tmp_path, counts, angles, kept
+):
+    class Model:
+        def __init__(self, n):
+            self.n = n
+
+        def num_reg_images(self):
+            return self.n
+
+    found, tried = iter(counts), []
+    monkeypatch.setattr(
+        posing,
+        "_models_from",
+        lambda angle, *_: tried.append(angle) or [Model(n) for n in next(found)],
+    )
+    models = posing._models(None, 12, tmp_path, tmp_path, PoseSection())
+    assert tried == angles and models[0].n == kept
+    assert len(models) == len(next(one for one in counts if kept in one))
 
 
 @pytest.mark.parametrize(
