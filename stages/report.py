@@ -323,7 +323,7 @@ def covisible_rows(figures: dict[str, Any] | None) -> list[Figure]:
     """PSNR of co-visible test pixels; nothing where no depth tells of them."""
     if figures is None:
         return []
-    of = f"co-visible pixels ({figures['share']:.0%} of those with depth)"
+    of = f"co-visible pixels ({figures['share']:.0%} of those with depth), views pooled"
     return [Figure(f"PSNR of {of}, dB", figures["psnr"], form="{:.2f}")]
 
 

@@ -20,7 +20,7 @@ from chebsplat.pipelines.work import store
 
 RUNS, FAILED, WAITS, LEFT, DONE = "runs", "failed", "waits", "not begun", "done"
 LINES = 5  # of a failed step's log
-NEARLY_ALL = 0.95  # of the test pixels: where training photos show more, PSNR is of the scene
+NEARLY_ALL = 0.95  # of the test pixels with depth: co-visible PSNR tells no more then
 
 
 def figures(evaluation: Path) -> Any:
@@ -89,13 +89,13 @@ def table(evaluation: Path) -> list[tuple[str, str, str]]:
 
 
 def covisible(figures: Any) -> tuple[str, str]:
-    """PSNR of the test pixels whose surface a training photo shows, and their share; empty where
-    these are nearly all, or no depth tells.
+    """PSNR of the test pixels whose surface a training photo shows, and their share of those with
+    depth; empty where these are nearly all, or there is no depth.
     """
     found = (figures or {}).get("image", {}).get("covisible")
     if not found or found["share"] > NEARLY_ALL:
         return "", ""
-    return f"{found['psnr']:.1f} dB", f"of the {found['share']:.0%} that training photos show"
+    return f"{found['psnr']:.1f} dB", f"{found['share']:.0%} of the pixels with depth"
 
 
 def as_taken(figures: Any) -> str:

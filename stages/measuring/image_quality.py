@@ -66,8 +66,8 @@ def covisible_figures(
     their `share` of the pixels with measured depth; None where depth tells of none.
 
     Args: cameras: of the scene; names: of the test views; renders: u8 [T, H, W, 3] of them.
-    Choices: on a grid of up to COVISIBLE_SIDE pixels a side, all views together. Masked pixels do
-      not count, nor do they show anything.
+    Choices: on a grid of up to COVISIBLE_SIDE pixels a side, errors of all views pooled. Masked
+      pixels do not count, nor do they show anything. Depth with noise beyond 3 % counts as hidden.
     """
     if capture.depth is None or capture.cam_from_world is None:
         return None

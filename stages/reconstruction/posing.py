@@ -31,7 +31,7 @@ from chebsplat.stages.sources.common import Shot, file_of
 
 log = logging.getLogger("chebsplat")
 MORE = 1.1  # times the photos of the best so far, that a costlier attempt must register
-HALF = 0.5  # of the photos: where fewer register, mapping begins again, then as a fisheye's
+HALF = 0.5  # of the photos: if fewer register, mapping starts from a smaller angle, then as fisheye
 FISHEYE = "OPENCV_FISHEYE"
 FAINT = 0.002  # SIFT's peak threshold where the usual one finds too little; it costs exactness
 WIDE = 0.5  # a fisheye's focal length in longer sides, without EXIF
@@ -187,11 +187,12 @@ def _models(
     """The models that mapping finds by a database, largest first.
 
     Choices: where fewer than HALF of the photos register, it begins again with a smaller angle
-      between the rays of its first pair, which counts where MORE times as many register. COLMAP
-      itself goes down to a quarter of an angle. Handheld photos of one side of a thing may lie
-      nearer to each other, and their widest pairs still share too little.
+      between the rays of its first pair, which counts where more pairs of photos then agree. If no
+      pair has an angle, COLMAP itself tries a half and a quarter of it, which is not enough for
+      handheld photos of one side of a thing.
     """
     best: list[pycolmap.Reconstruction] = []
+    most = -1
     for angle in INIT_ANGLES:
         n_registered = best[0].num_reg_images() if best else 0
         if n_registered >= HALF * n_photos:
@@ -203,8 +204,8 @@ def _models(
                 n_photos,
             )
         tried = _models_from(angle, job, n_photos, pictures, database, settings)
-        if tried and tried[0].num_reg_images() > MORE * n_registered:
-            best = tried
+        if tried and (agreeing := judge.pairs(tried[0], database, judge.FEW).n_agree) > most:
+            best, most = tried, agreeing
     return best
 
 

@@ -143,7 +143,7 @@ def test_frames_a_second_of_a_finished_scene_name_the_machine_that_rendered_them
 @pytest.mark.parametrize(
     ("found", "told"),
     [
-        ({"psnr": 22.04, "share": 0.61}, ("22.0 dB", "of the 61% that training photos show")),
+        ({"psnr": 22.04, "share": 0.61}, ("22.0 dB", "61% of the pixels with depth")),
         ({"psnr": 22.04, "share": 0.951}, ("", "")),
         (None, ("", "")),
     ],

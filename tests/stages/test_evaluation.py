@@ -21,6 +21,7 @@ from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.work import summary
 from chebsplat.render import SceneRenderer, frame_parts
 from chebsplat.stages.evaluate import camera
+from chebsplat.stages.measuring import image_quality
 from chebsplat.stages.measuring.image_quality import (
     covisible_figures,
     enlarged,
@@ -160,12 +161,14 @@ def covisible_of(capture, views=(0, 1, 2, 3), poses=None):
     return covisible_figures(capture, cameras, ["test"], render)
 
 
-def test_covisible_pixels_are_those_whose_surface_a_training_photo_shows():
+def test_covisible_pixels_are_those_whose_surface_a_training_photo_shows(monkeypatch):
     wall = wall_capture()
     assert covisible_of(wall) == {"psnr": 100.0, "share": 0.5}
     assert covisible_of(wall, views=(0, 2, 3)) is None  # what no camera of the scene shows
     assert covisible_of(wall, poses=np.tile(np.eye(4), (4, 1, 1)))["share"] == 1.0
     assert covisible_of(wall_capture(depth=None)) is None
+    monkeypatch.setattr(image_quality, "COVISIBLE_SIDE", 2)  # every other row and column
+    assert covisible_of(wall) == {"psnr": 100.0, "share": 0.5}
     assert covisible_of(wall_capture(cam_from_world=None)) is None
 
 
@@ -203,6 +206,8 @@ def test_a_test_view_without_a_pixel_that_counts_is_left_out_and_undistorted_pho
         summary_rows(figures, None, {"milliseconds": {}}, timed)[0].name
         for figures in (whole, found)
     ]
+    names = [row.name for row in summary_rows(whole, None, {"milliseconds": {}}, timed)]
+    assert any(name.startswith("PSNR of co-visible pixels") for name in names)
     assert "undistorted" not in rows[0] and "of undistorted photos" in rows[1]
 
 

@@ -197,33 +197,31 @@ def test_photos_taken_side_by_side_without_a_focal_length_register(tmp_path, cap
 
 
 @pytest.mark.parametrize(
-    ("counts", "angles", "kept"),
-    [
-        ([[6]], [16.0], 6),
-        ([[5], [12]], [16.0, 2.0], 12),
-        ([[5, 3], [5]], [16.0, 2.0], 5),
-        ([[], [2]], [16.0, 2.0], 2),
+    ("found", "angles", "kept"),
+    [  # (photos registered, pairs that agree) of the largest model at each angle
+        ([(6, 9)], [16.0], 0),
+        ([(5, 9), (12, 40)], [16.0, 2.0], 1),
+        ([(5, 9), (12, 8)], [16.0, 2.0], 0),
+        ([None, (2, 1)], [16.0, 2.0], 1),
     ],
 )
-def test_mapping_begins_again_where_few_register_and_counts_where_more_do(
-    monkeypatch, tmp_path, counts, angles, kept
+def test_mapping_begins_again_where_few_register_and_counts_where_more_pairs_agree(
+    monkeypatch, found, angles, kept
 ):
     class Model:
-        def __init__(self, n):
-            self.n = n
+        def __init__(self, n, n_agree):
+            self.n, self.n_agree = n, n_agree
 
         def num_reg_images(self):
             return self.n
 
-    found, tried = iter(counts), []
+    models, tried = [[Model(*one)] if one else [] for one in found], []
     monkeypatch.setattr(
-        posing,
-        "_models_from",
-        lambda angle, *_: tried.append(angle) or [Model(n) for n in next(found)],
+        posing, "_models_from", lambda angle, *_: tried.append(angle) or models[len(tried) - 1]
     )
-    models = posing._models(None, 12, tmp_path, tmp_path, PoseSection())
-    assert tried == angles and models[0].n == kept
-    assert len(models) == len(next(one for one in counts if kept in one))
+    monkeypatch.setattr(judge, "pairs", lambda model, *_: model)
+    assert posing._models(None, 12, None, None, PoseSection()) is models[kept]
+    assert tried == angles
 
 
 @pytest.mark.parametrize(
