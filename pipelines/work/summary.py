@@ -92,10 +92,10 @@ def covisible(figures: Any) -> tuple[str, str]:
     """PSNR of the test pixels whose surface a training photo shows, and their share of those with
     depth; empty where these are nearly all, or there is no depth.
     """
-    found = (figures or {}).get("image", {}).get("covisible")
-    if not found or found["share"] > NEARLY_ALL:
+    shown = (figures or {}).get("image", {}).get("covisible")
+    if not shown or shown["share"] > NEARLY_ALL:
         return "", ""
-    return f"{found['psnr']:.1f} dB", f"{found['share']:.0%} of the pixels with depth"
+    return f"{shown['psnr']:.1f} dB", f"{shown['share']:.0%} of the pixels with depth"
 
 
 def as_taken(figures: Any) -> str:
