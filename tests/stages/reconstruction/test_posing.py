@@ -196,6 +196,31 @@ def test_photos_taken_side_by_side_without_a_focal_length_register(tmp_path, cap
     assert camera.mean_focal_length() == pytest.approx(560, rel=0.02)
 
 
+@pytest.mark.parametrize("zoom", [0.0, 0.1])
+def test_photos_whose_focal_lengths_differ_have_their_own(zoom, tmp_path):
+    rng, turns = np.random.default_rng(0), np.linspace(-0.8, 0.8, 16)
+    poses, focals = np.tile(np.eye(4), (16, 1, 1)), 500 * np.linspace(1, 1 + zoom, 16)
+    poses[:, :3, :3] = Rotation.from_euler("y", turns[:, None]).as_matrix()
+    poses[:, 2, 3] = 6
+    points = rng.uniform(-1.8, 1.8, (200, 3))
+    features = []
+    for pose, focal in zip(poses, focals, strict=True):
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        pixels = focal * local[:, :2] / local[:, 2:] + [400, 300]
+        features.append(dict(enumerate(pixels + rng.normal(0, 0.2, pixels.shape))))
+    database = write_features(tmp_path, features)
+    shots = [Shot(file_of(k), tmp_path / file_of(k), (800, 600)) for k in range(16)]
+    job = Job({}, Config(), tmp_path / "out", tmp_path)
+    model = posing._mapped(job, shots, tmp_path, database, PoseSection())
+    assert len(model.names) == 16 and model.judged["doubts"] == []
+    assert len(model.cameras) == (16 if zoom else 1)
+    found = [model.cameras[k][1][0] for k in model.camera]
+    assert found == pytest.approx(focals if zoom else 16 * [500], rel=0.01)
+    scale, rotation, shift = alignment(model.cam_from_world, poses)
+    away = scale * centers(model.cam_from_world) @ rotation.T + shift - centers(poses)
+    assert np.abs(away).max() < 0.03  # of a unit, at 6 units; with one focal length .2
+
+
 @pytest.mark.parametrize(
     ("found", "angles", "kept"),
     [  # (photos registered, pairs that agree) of the largest model at each angle
@@ -520,8 +545,9 @@ PLAIN, ZOOMED = lenses.Lens(0, 0, 1.0), lenses.Lens(0, 0, 0.5)
         (lambda k: (PLAIN, ZOOMED)[k >= 10], False),  # zoomed halfway
         (lambda k: (lenses.LENSES["action"], lenses.LENSES["zoom"])[k % 2], False),
         (lambda k: lenses.Lens(0, 0, 1 - 0.015 * k), False),
+        (lambda k: lenses.Lens(0, 0, 1 - 0.005 * k), True),
     ],
-    ids=["one lens", "zoomed halfway", "two lenses by turns", "a zoom that moves"],
+    ids=["one lens", "zoomed", "two lenses by turns", "a zoom of a third", "a zoom of a tenth"],
 )
 def test_a_mirror_is_no_trouble_and_photos_of_two_lenses_are_not_passed_in_silence(
     mirrored, lens_of, right, tmp_path
