@@ -33,8 +33,8 @@ HOMOGRAPHIES = {
     for name in ("PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC")
 }
 SCARCE = 60  # points of the median photo
-# of `posing.focal_spread`: of two lenses .3, of a zoom that goes by a third .24, after which own
-# focal lengths leave 2 to 4 cm in a room where one lens has 1, of a focus that breathes .07
+# span of the middle 80 % of the photos' own focal lengths, in ln: of two lenses .3; of a zoom that
+# goes by a third .24, where own focal lengths leave 2 to 4 cm in a room, one lens 1
 ZOOMED = 0.1
 LOOSE = 1.5e-3  # of the longer side: a reprojection error of 2.4 pixels in 1,600
 REMEDY = (
@@ -169,7 +169,7 @@ def judge_model(
 
     Args: others: photos in each further model, which share nothing with this one; n_misplaced: left
       out of it; mapped_error: reprojection error, pixels, before outliers were removed;
-      focal_spread: `posing.focal_spread`.
+      focal_spread: of the photos' own focal lengths, as ZOOMED is.
     """
     images = [model.images[key] for key in graph.images if model.images[key].has_pose]
     side = max(max(camera.width, camera.height) for camera in model.cameras.values())
@@ -238,8 +238,8 @@ def doubts(facts: dict[str, Any]) -> list[str]:
         )
     if facts["focal_spread"] > ZOOMED:
         messages.append(
-            f"Focal lengths of the photos differ by {math.expm1(facts['focal_spread']):.0%}; each "
-            "has its own, less exactly: lock focus and zoom, or make a scene of the photos of each."
+            f"Focal lengths of the photos differ by {math.expm1(facts['focal_spread']):.0%}, which "
+            "makes poses less exact: lock focus and zoom, or make a scene of each lens."
         )
     if facts["points_a_view"] < SCARCE:
         messages.append(

@@ -6,6 +6,7 @@ Where the usual features and lens fail, more features are tried, and a fisheye's
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 from collections.abc import Sequence
 from copy import copy
@@ -40,10 +41,12 @@ STRAY = 3.0  # pixels of the pictures that photos are reduced to
 FLATTEST = 1.5  # degrees between the rays of a point: COLMAP's own
 # degrees between the rays of the pair that mapping begins with: COLMAP's own, and where it fails
 INIT_ANGLES = 16.0, 2.0
-# `focal_spread` and part of the reprojection error beyond which photos have focal lengths of their
-# own: in two rooms through one lens .01 and 1.00, and own ones cost 2 mm; through a zoom that goes
-# by 5 % .03 and .94, and they gain 1 to 2 cm; in four real captures up to .03 and down to .97
+# Photos have focal lengths of their own where the middle 80 % of these span more than ONE_LENS, in
+# ln, and lower the reprojection error to CLEARER. Rooms rendered through one lens span .01, and the
+# error stays; through a zoom that goes by 5 % .03, to .94, and cameras lie 1 to 2 cm nearer. Of
+# three real captures one spans .026, to .97.
 ONE_LENS, CLEARER = 0.02, 0.96
+KEPT, WILD = 0.98, 0.7  # of the points, at least; in ln, which no photo's focal length differs by
 # distortion terms of camera models
 LENSES = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "OPENCV": 4, "OPENCV_FISHEYE": 4}
 
@@ -146,10 +149,9 @@ def _mapped(
         _free_second_term(model)
     _refine(model)
     own = _with_own_focals(model)
-    spread = focal_spread(own, model)
-    error = model.compute_mean_reprojection_error()
-    if spread > ONE_LENS and own.compute_mean_reprojection_error() < CLEARER * error:
-        log.info("focal lengths of the photos differ by %.1f %%: each has its own", 100 * spread)
+    ratios = _focal_ratios(own, model)
+    low, high = np.quantile(ratios, (0.1, 0.9))
+    if high - low > ONE_LENS and _fits_better(own, model) and np.abs(ratios).max() < WILD:
         model = own
     sizes = [other.num_reg_images() for other in others]
     judged = judge.judge_model(
@@ -159,7 +161,7 @@ def _mapped(
         sizes,
         len(misplaced),
         mapped_error,
-        spread,
+        float(high - low),
     )
     return _collected(model, shots, judged)
 
@@ -286,6 +288,9 @@ def _adjusting() -> pycolmap.BundleAdjustmentOptions:
 def _with_own_focals(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """A copy of a model, adjusted, in which each photo has a camera of its own: its focal length is
     free, its distortion the model's.
+
+    Choices: one focal length for all hides a zoom that moves, or a focus: poses make up for it, by
+      centimetres, and points still fit.
     """
     own = pycolmap.Reconstruction()
     for identity, image in model.images.items():
@@ -306,21 +311,28 @@ def _with_own_focals(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return own
 
 
-def focal_spread(own: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> float:
-    """Range of the middle 80 % of the photos' own focal lengths over the model's, in ln.
-
-    Choices: a model of one focal length hides a zoom that moves, or a focus: poses make up for it,
-      by centimetres, and points still fit. Photos of all directions have no focal length, and
-      spread by 0.
+def _focal_ratios(own: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> np.ndarray:
+    """ln of the ratio of each photo's own focal length to the model's; [0] where none has one, as
+    photos of all directions.
     """
-    ratios = [
-        own.cameras[identity].mean_focal_length() / camera.mean_focal_length()
+    pairs = [
+        (own.cameras[identity], model.cameras[model.images[identity].camera_id])
         for identity, image in own.images.items()
-        if (camera := model.cameras[model.images[identity].camera_id]).focal_length_idxs()
-        and own.cameras[identity].mean_focal_length() > 0
+        if image.has_pose
     ]
-    low, high = np.quantile(np.log(ratios or [1.0]), (0.1, 0.9))
-    return float(high - low)
+    ratios = [
+        max(camera.mean_focal_length(), 1e-9) / shared.mean_focal_length()
+        for camera, shared in pairs
+        if shared.focal_length_idxs()
+    ]
+    return np.array([math.log(ratio) for ratio in ratios or [1.0]])
+
+
+def _fits_better(own: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> bool:
+    """True where own focal lengths lower the error to CLEARER, and not by losing points."""
+    most = CLEARER * model.compute_mean_reprojection_error()
+    kept = own.num_points3D() > KEPT * model.num_points3D()
+    return bool(kept and own.compute_mean_reprojection_error() < most)
 
 
 def _collected(
@@ -353,6 +365,7 @@ def _collected(
     lenses = ", ".join(
         f"{name} {[round(value, 4) for value in params]}" for name, params, *_ in cameras[:3]
     )
+    more = "" if len(cameras) <= 3 else f", and {len(cameras) - 3} more"
     return PhotoModel(
         [shots[row].name for row in rows],
         cameras,
@@ -365,7 +378,7 @@ def _collected(
         [shots[row].frame for row in rows],
         [
             judge.sentence(judged),
-            f"{len(cameras)} camera{'s' if len(cameras) > 1 else ''} in pixels: {lenses}.",
+            f"{len(cameras)} camera{'s' if len(cameras) > 1 else ''} in pixels: {lenses}{more}.",
         ],
         judged,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,6 +41,7 @@ from chebsplat.stages.sources.pictures import (
 WORKERS = 4
 MOST_EMPTY = 1 / 3  # of the views that see a point
 OWN_SIDE = 1600  # pixels: size limit of photos as taken, as in published comparisons
+MOST_CUT = 0.03  # of a view's width and height, to make views as large as others
 COMPARED = 8  # views whose variance is compared with their photos'
 
 
@@ -59,7 +60,7 @@ def assemble(
       name.
     """
     frames, notes = choose_frames(listing, settings)
-    shapes = [geometry(frame.camera, settings.max_side) for frame in frames]
+    shapes = geometries([frame.camera for frame in frames], settings.max_side)
     full = (
         len(frames),
         max(shape.height for shape in shapes),
@@ -320,6 +321,25 @@ def geometry(camera: Camera, max_side: int) -> Geometry:
         [[fx * w / width, 0, cx * w / width], [0, fy * h / height, cy * h / height], [0, 0, 1.0]]
     )
     return Geometry(K, w, h, factor)
+
+
+def geometries(
+    cameras: Sequence[Camera], max_side: int, most_cut: float = MOST_CUT
+) -> list[Geometry]:
+    """The views of photos; where lenses are almost alike, those of one photo size are of one size.
+
+    Choices: focal lengths of their own make undistorted sizes differ by pixels. All are cut at the
+      right and the bottom to the smallest, unless that costs more than `most_cut` of a side.
+    """
+    shapes = {camera: geometry(camera, max_side) for camera in set(cameras)}
+    for photo in {(camera.width, camera.height) for camera in shapes}:
+        alike = [camera for camera in shapes if (camera.width, camera.height) == photo]
+        sizes = np.array([[shapes[camera].width, shapes[camera].height] for camera in alike])
+        if (sizes.min(0) >= (1 - most_cut) * sizes.max(0)).all():
+            width, height = sizes.min(0).tolist()
+            for camera in alike:
+                shapes[camera] = replace(shapes[camera], width=width, height=height)
+    return [shapes[camera] for camera in cameras]
 
 
 def positions(camera: Camera, view: Geometry) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -75,31 +76,36 @@ def save(frames: Sequence[Shot], _: Path, pictures: Path, max_side: int) -> None
 def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, Any]:
     """The fields of a capture: the frames of a model, undistorted, and its points."""
     (file,) = files(path)
-    camera = cameras.camera_of(file, *model.cameras[0])
-    view = assembly.geometry(camera, settings.max_side)
-    at = assembly.positions(camera, view)
     notes, rows = list(model.notes), np.arange(len(model.names))
     if settings.max_views is not None and settings.max_views < len(rows):
         rows = np.linspace(0, len(rows) - 1, settings.max_views).round().astype(int)
         notes.append(f"{len(rows)} of {len(model.names)} views are used (ingest.max_views).")
-    if view.factor < 1:
-        notes.append(f"Images are reduced by {view.factor:.3f} (ingest.max_side).")
-    named = {model.frames[row]: model.names[row] for row in rows}
-    images, shares, step = [], [], max(len(named) // assembly.COMPARED, 1)
-    for k, (_, image) in enumerate(_read_frames(file, set(named))):
-        images.append(assembly.resampled(image, camera, view, at))
+    lenses = [cameras.camera_of(file, *camera) for camera in model.cameras]
+    shapes = assembly.geometries(lenses, settings.max_side, most_cut=1)  # frames are one stack
+    if (least := min(shape.factor for shape in shapes)) < 1:
+        notes.append(f"Images are reduced by {least:.3f} (ingest.max_side).")
+    row_of = {model.frames[row]: row for row in rows}
+    lookup = functools.lru_cache(1)(assembly.positions)
+    images, shares, step = [], [], max(len(rows) // assembly.COMPARED, 1)
+    for k, (frame, image) in enumerate(_read_frames(file, set(row_of))):
+        lens = lenses[model.camera[row_of[frame]]]
+        view = shapes[model.camera[row_of[frame]]]
+        at = lookup(lens, view)
+        images.append(assembly.resampled(image, lens, view, at))
         if k % step == 0:
             shares.append(assembly.variance_kept(image, images[-1], at))
 
     def altered(names: set[str]) -> Iterator[tuple[str, cameras.Camera, Any]]:
-        changed = camera.model in cameras.DISTORTED or view.factor < 1
-        numbers = {frame for frame, name in named.items() if name in names and changed}
-        return ((named[frame], camera, image) for frame, image in _read_frames(file, numbers))
+        changed = lenses[0].model in cameras.DISTORTED or least < 1
+        numbers = {frame for frame, row in row_of.items() if model.names[row] in names and changed}
+        for frame, image in _read_frames(file, numbers):
+            row = row_of[frame]
+            yield model.names[row], lenses[model.camera[row]], image
 
     fields = {
-        "names": list(named.values()),
+        "names": [model.names[row] for row in rows],
         "images": np.stack(images),
-        "Ks": np.tile(view.K, (len(images), 1, 1)),
+        "Ks": np.stack([shapes[camera].K for camera in model.camera[rows]]),
         "cam_from_world": model.cam_from_world[rows],
         "source": {"kind": "video", "notes": notes},
         "altered": altered,

@@ -4,6 +4,7 @@ believed are refused.
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -219,6 +220,18 @@ def test_photos_whose_focal_lengths_differ_have_their_own(zoom, tmp_path):
     scale, rotation, shift = alignment(model.cam_from_world, poses)
     away = scale * centers(model.cam_from_world) @ rotation.T + shift - centers(poses)
     assert np.abs(away).max() < 0.03  # of a unit, at 6 units; with one focal length .2
+
+
+@pytest.mark.parametrize(
+    ("error", "n_points", "better"), [(0.9, 99, True), (0.99, 100, False), (0.5, 90, False)]
+)
+def test_own_focal_lengths_are_better_where_points_fit_and_stay(error, n_points, better):
+    def model(error, n_points):
+        return SimpleNamespace(
+            compute_mean_reprojection_error=lambda: error, num_points3D=lambda: n_points
+        )
+
+    assert posing._fits_better(model(error, n_points), model(1.0, 100)) == better
 
 
 @pytest.mark.parametrize(

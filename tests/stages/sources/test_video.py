@@ -16,7 +16,8 @@ from chebsplat.pipelines.planning.raw import raw_files
 from chebsplat.pipelines.work import scenes
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import IngestSection, PoseSection
-from chebsplat.stages.sources import common, video
+from chebsplat.stages.sources import assembly, common, video
+from chebsplat.stages.sources.cameras import Camera
 from chebsplat.stages.sources.common import file_of
 
 RATE, SPEED = 30, 2  # frames/s, pixels a frame
@@ -113,6 +114,43 @@ def filmed(file, settings):
     )
     model.frames = [shot.frame for shot in shots]
     return video.read(file, settings, model)
+
+
+def test_each_frame_is_undone_of_its_own_lens(tmp_path, monkeypatch):
+    rng, numbers = np.random.default_rng(0), [3, 8]
+    pixels = gaussian_filter(rng.uniform(0, 255, (2, 120, 160, 3)), (0, 1, 1, 0)).astype(np.uint8)
+    pictures = dict(zip(numbers, map(Image.fromarray, pixels), strict=True))
+    monkeypatch.setattr(
+        video, "_read_frames", lambda _, asked: ((k, pictures[k]) for k in sorted(asked))
+    )
+    model = model_of(["a", "b"], [(160, 120)] * 2, [None] * 2)
+    model.frames = numbers
+    model.cameras = [["SIMPLE_RADIAL", [f, 80.0, 60.0, -0.1], 160, 120] for f in (150.0, 180.0)]
+    fields = video.read(tmp_path / "a.mp4", IngestSection(), model)
+    lenses = [Camera(*camera[:1], tuple(camera[1]), *camera[2:]) for camera in model.cameras]
+    views = assembly.geometries(lenses, 640)
+    for k, (lens, view) in enumerate(zip(lenses, views, strict=True)):
+        assert (fields["Ks"][k] == view.K).all() and view.K[0, 0] == lens.params[0]
+        at = assembly.positions(lens, view)
+        assert (
+            fields["images"][k] == assembly.resampled(pictures[numbers[k]], lens, view, at)
+        ).all()
+    taken = list(fields["altered"]({"b"}))
+    assert [(name, lens.params) for name, lens, _ in taken] == [("b", lenses[1].params)]
+
+
+@pytest.mark.parametrize(("lens", "cut"), [((440.0, -0.05), True), ((400.0, -0.2), False)])
+def test_views_through_almost_the_same_lens_are_of_one_size(lens, cut):
+    lenses = [
+        Camera("SIMPLE_RADIAL", (focal, 400.0, 300.0, term), 800, 600)
+        for focal, term in ((400.0, -0.05), lens)
+    ]
+    own = [assembly.geometry(lens, 800) for lens in lenses]
+    found = assembly.geometries(lenses, 800)
+    assert (own[0].width, own[0].height) != (own[1].width, own[1].height)
+    assert ((found[0].width, found[0].height) == (found[1].width, found[1].height)) == cut
+    for mine, view in zip(own, found, strict=True):
+        assert (mine.K == view.K).all() and view.width <= mine.width and view.height <= mine.height
 
 
 @pytest.mark.parametrize(
