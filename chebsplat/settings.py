@@ -130,9 +130,6 @@ class TrainSection(Section):
         "nothing; default: lifted from 40 views on",
     )
     prune: bool = setting(True, "remove Gaussians that add nothing")
-    prune_semantic: bool = setting(
-        True, 'features guard Gaussians from pruning; false: "no semantic guidance"'
-    )
     densify: Literal["mixed", "region", "classic", "off"] = setting(
         "mixed", "where Gaussians grow; mixed: region and classic by turns"
     )

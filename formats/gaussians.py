@@ -27,7 +27,7 @@ class Gaussians:
       [N], `sh0` [N,1,3], `shN` [N,15,3], `degrees` u8 [N] highest SH band kept, and, where the
       scene has a semantic branch, `features` [N,C].
     cameras:    of the views it was trained and may be evaluated on.
-    modules:    weights of the semantic gate by dotted name; empty where they were left out.
+    modules:    of the printed method: weights of its modules and bases of its knowledge, by name.
     trace:      one row a report interval: error against run time.
     notes:      label names, and what the scene left out and why.
     """

@@ -42,7 +42,7 @@ def run(job: Job) -> None:
         raise DataFailure(
             "no Gaussian is left; lower train.weight_mask or raise train.min_gaussians"
         )
-    job.facts |= facts_of(job, trainer, parameters, features) | {"psnr": trace[-1]["psnr"]}
+    job.facts |= facts_of(job, trainer, parameters) | {"psnr": trace[-1]["psnr"]}
     if features is not None and "features" in parameters:
         job.facts["right"] = labels_right(
             inputs.capture, parameters, parameters["features"], features

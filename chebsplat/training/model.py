@@ -1,4 +1,4 @@
-"""The trainable scene: Gaussians with colour and meaning, and the modules that guide them."""
+"""The trainable scene: Gaussians with colour and meaning."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call
 
 from chebsplat.rasterize import rasterize
 from chebsplat.rasterize.cells import CELL
@@ -40,7 +39,7 @@ class RenderOptions(NamedTuple):
 class Auxiliary:
     """Values that losses need beside the picture; None where not asked for, or not there.
 
-    soft_mask: m̂ [V] of the pruning gates; band_masks [V, 3]; in_view bool [V], None: all are. Of
+    soft_mask: m̂ [V] of the pruning masks; band_masks [V, 3]; in_view bool [V], None: all are. Of
       the printed method: soft_mask [N] and delta [N, 4] of all Gaussians, fused features [V, C],
       and L_reg [] (`knowledge`).
     """
@@ -70,7 +69,7 @@ class Rendered:
 
 
 class SceneModel:
-    """Raw parameters by name, each [N, ...] and a leaf tensor, and the semantic gate beside them.
+    """Raw parameters by name, each [N, ...] and a leaf tensor.
 
     `features` [N, C], `prune_logits` [N] and `sh_logits` [N, 3] are there only if the scene needs
     them, and SH band l, `sh<l>` [N_l, 2 l + 1, 3], only for the first N_l Gaussians: all until the
@@ -97,6 +96,7 @@ class SceneModel:
         if n_channels is not None:
             self.raw["features"] = torch.zeros(n, n_channels, device=device)
         if train.prune:
+            # m̂ = .73: from 3 a short training closes no mask
             self.raw["prune_logits"] = torch.full((n,), 1.0, device=device)
         if train.sh_prune and train.sh_degree > 0:
             self.raw["sh_logits"] = torch.zeros(n, 3, device=device)
@@ -104,9 +104,6 @@ class SceneModel:
             value.requires_grad_(True)
         self.renders_all = device.type == "cuda" and backend != "reference"
         self.replay = Replay(self.renders_all)
-        self.semantic_gate: prune.SemanticGate | None = None
-        if n_channels and train.prune and train.prune_semantic:
-            self.semantic_gate = prune.SemanticGate(n_channels).to(device)
 
     def __len__(self) -> int:
         return len(self.raw["means"])
@@ -123,8 +120,8 @@ class SceneModel:
 
     @property
     def modules(self) -> dict[str, nn.Module]:
-        """Modules that learn beside raw parameters, by name: the semantic gate, if any."""
-        return {} if self.semantic_gate is None else {"semantic_gate": self.semantic_gate}
+        """Modules that learn beside raw parameters, by name: those of the printed method."""
+        return {}
 
     def bands(self) -> list[Tensor]:
         """Coefficients [N_l, 2 l + 1, 3] of SH bands 0 to the highest of any Gaussian."""
@@ -147,34 +144,9 @@ class SceneModel:
         """Highest open band u8 [N] of each Gaussian, which keeps it for good."""
         return sh_prune.degrees(self.open_bands())
 
-    @property
-    def learned(self) -> dict[str, Tensor]:
-        """The raw parameters, and the weights of the modules as `<module>.<weight>`."""
-        weights = {
-            f"{name}.{k}": w
-            for name, module in self.modules.items()
-            for k, w in module.named_parameters()
-        }
-        return self.raw | weights
-
     def soft_mask(self) -> Tensor | None:
-        """m̂ [N] in (0, 1) of the pruning gates of all Gaussians, None where pruning is off."""
-        return self._soft_mask(self.learned, None, self.raw.get("features"))
-
-    def _soft_mask(
-        self, learned: Mapping[str, Tensor], index: Tensor | None, features: Tensor | None
-    ) -> Tensor | None:
-        if "prune_logits" not in learned:
-            return None
-        semantic, prefix = None, "semantic_gate."
-        if self.semantic_gate is not None and features is not None:
-            weights = {
-                name.removeprefix(prefix): w
-                for name, w in learned.items()
-                if name.startswith(prefix)
-            }
-            semantic = functional_call(self.semantic_gate, weights, (features.detach(),))
-        return prune.soft_mask(take(learned["prune_logits"], index), semantic)
+        """m̂ [N] in (0, 1) of the pruning masks of all Gaussians, None where pruning is off."""
+        return prune.soft_mask(self.raw["prune_logits"]) if "prune_logits" in self.raw else None
 
     def render(
         self,
@@ -199,14 +171,11 @@ class SceneModel:
         if not self.renders_all:
             with torch.no_grad():
                 index = in_frustum(self.raw["means"], view, _reach(self.raw))
-        options, learned = (
-            RenderOptions(degree, masked, semantic, depth, (view.width, view.height)),
-            self.learned,
-        )
+        options = RenderOptions(degree, masked, semantic, depth, (view.width, view.height))
         activated = self.replay(
             options,
-            partial(self._activate, options, tuple(learned), index),
-            list(learned.values()),
+            partial(self._activate, options, tuple(self.raw), index),
+            list(self.raw.values()),
             [view.viewmat, view.K],
         )
         gaussians: list[Any] = [
@@ -250,7 +219,7 @@ class SceneModel:
     ) -> dict[str, Tensor]:
         """Values of the Gaussians `index` as the rasterizer takes them, and their masks, by name.
 
-        Args: tensors: what is `learned`, by names; then the view's viewmat and K.
+        Args: tensors: the raw parameters of these names; then the view's viewmat and K.
         """
         raw, (viewmat, K) = dict(zip(names, tensors, strict=False)), tensors[-2:]
         means, quats = take(raw["means"], index), take(raw["quats"], index)
@@ -258,10 +227,9 @@ class SceneModel:
             take(raw["log_scales"], index).exp(),
             take(raw["logit_opacities"], index).sigmoid(),
         )
-        features = take(raw["features"], index) if "features" in raw else None
         activated: dict[str, Tensor] = {}
-        if options.masked and (soft := self._soft_mask(raw, index, features)) is not None:
-            activated["soft_mask"] = soft
+        if options.masked and "prune_logits" in raw:
+            soft = activated["soft_mask"] = prune.soft_mask(take(raw["prune_logits"], index))
             scales, opacities = prune.apply_mask(prune.hard_mask(soft), scales, opacities)
         masks = None
         if options.masked and options.degree > 0 and "sh_logits" in raw:
@@ -273,7 +241,8 @@ class SceneModel:
         ]
         if options.depth:
             channels.append(planes_in_view(means, quats, scales, viewmat, K, NEAREST))
-        if options.semantic and features is not None:  # the masks have seen them in any case
+        if options.semantic and "features" in raw:
+            features = take(raw["features"], index)
             if index is None:
                 channels.append(features)
             else:

@@ -87,7 +87,6 @@ class PrintedScene(SceneModel):
     ):
         self.printed, self.without = Modules(n_channels, describe, train.without), train.without
         super().__init__(raw, describe, train, n_channels, backend)
-        self.semantic_gate = None
         if "sh_logits" in self.raw:
             self.raw["sh_logits"] = torch.zeros(
                 len(self), 4, device=self.device, requires_grad=True

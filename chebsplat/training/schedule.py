@@ -13,7 +13,7 @@ from chebsplat.training.model import SceneModel
 
 STEP_SIDE = 640  # pixels of the longer side of what a step looks at, at least
 LR_OPACITIES = 5e-2  # of opacities before the sigmoid, 3DGS's
-LR_MODULES = 3e-3  # of the semantic gate
+LR_MODULES = 3e-3  # of the printed modules
 # what a rate has fallen to at the end; 0.1 elsewhere
 FASTER = {"means": 0.01, "features": 0.01, "modules": 0.01}
 

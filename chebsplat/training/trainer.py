@@ -142,11 +142,6 @@ class Trainer:
             return None
         return self.model.soft_mask()
 
-    @torch.no_grad()
-    def final_mask(self) -> Tensor | None:
-        """m̂ [N] of all Gaussians as they are, None without pruning."""
-        return self._soft_mask(self.share)
-
     def state_dict(self) -> dict[str, Any]:
         """All that the steps to come depend on: tensors (shared, not copied) and plain values."""
         return {

@@ -47,8 +47,6 @@ FIGURES = (
     Figure("lpips", "LPIPS", 3),
     Figure("n_gaussians", "Gaussians", 0, 1, True),
     Figure("sh_kept", "SH coefficients kept, %", 1, 100),
-    Figure("mask_spread", "spread of m̂ between classes", 3),
-    Figure("band_spread", "spread of SH kept between classes", 3),
     Figure("bytes_ply", "PLY, MB", 2, 1e-6, True),
     Figure("bytes_ragged", "ragged, MB", 2, 1e-6, True),
     Figure("frames_per_second", "frames/s", 1, 1, True, "rendered_on"),
@@ -91,7 +89,7 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
     trace = read_trace(targets["train"], train)
     segmentation = figures.get("segmentation") or {}
     row |= segmentation_columns(segmentation.get("scene", {}), segmentation.get("teacher", {}))
-    counts, guidance = scene.facts["by_degree"], train.facts.get("guidance", {})
+    counts = scene.facts["by_degree"]
     n_coefficients = sum(n * (degree + 1) ** 2 for degree, n in enumerate(counts))
     return row | {
         "state": "done",
@@ -108,7 +106,6 @@ def row_of(run: Run, failed: dict[str, tuple[int, str, Path]]) -> Row:
         **{key: figures["protocol"][key] for key in ("resolution", "split")},
         "n_gaussians": figures["n_gaussians"],
         "sh_kept": n_coefficients / (16 * sum(counts)),
-        **{key: guidance.get(key) for key in ("mask_spread", "band_spread")},
         "bytes_ply": figures["bytes"]["ply"],
         "bytes_ragged": figures["bytes"]["ragged"],
         "frames_per_second": figures["frames_per_second"].get("color"),

@@ -286,7 +286,7 @@ def _lesson(out: Path) -> None:
 def _gaussians(out: Path) -> None:
     trace = [{"step": 10.0, "seconds": 1.0, "n": float(N), "psnr": 20.0}]
     notes = NOTES | {"label_names": LABELS}
-    modules = {"semantic_gate.linear.weight": np.ones((1, C), np.float32)}
+    modules = {"printed.gate.weight": np.ones((1, C), np.float32)}
     Gaussians(_parameters(), _cameras(), modules, trace, notes).write(out)
 
 

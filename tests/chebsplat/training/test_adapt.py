@@ -40,22 +40,12 @@ def grow(parameters, members, gradient, budget=50, threshold=1e-4, seed=0, **opt
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_mask_is_exactly_binary_forward_and_soft_backward(dtype):
     logits = torch.linspace(-8, 8, 333, dtype=dtype, requires_grad=True)
-    soft = prune.soft_mask(logits, None)
+    soft = prune.soft_mask(logits)
     hard = prune.hard_mask(soft)
     assert set(hard.detach().tolist()) == {0.0, 1.0}
     assert torch.equal(hard.detach() == 1, soft.detach() > prune.THRESHOLD)
     hard.sum().backward()
     assert torch.allclose(logits.grad, (soft * (1 - soft)).detach())
-
-
-def test_semantic_gate_starts_open_and_alike_and_can_learn():
-    gate = prune.SemanticGate(5)
-    features = torch.randn(40, 5, generator=seeded())
-    logits = gate(features)
-    assert (logits == 1).all()
-    prune.soft_mask(torch.ones(40), logits).mean().backward()
-    assert gate.linear.bias.grad.abs() > 0
-    assert gate.linear.weight.grad.abs().max() > 0
 
 
 # densification by regions

@@ -263,10 +263,10 @@ def test_a_breakdown_is_named():
 
 
 def test_weights_that_break_are_never_published():
-    made = tiny_trainer()
+    made = tiny_trainer(method="printed", steps=6)
     with torch.no_grad():
-        made.model.semantic_gate.linear.bias[0] = torch.inf
-    with pytest.raises(DataFailure, match=r"not finite: semantic_gate.linear.bias"):
+        made.model.printed.pruning.output.bias[0] = torch.inf
+    with pytest.raises(DataFailure, match=r"not finite: printed.pruning.output.bias"):
         made.finish()
 
 
