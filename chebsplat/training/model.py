@@ -96,7 +96,7 @@ class SceneModel:
         if n_channels is not None:
             self.raw["features"] = torch.zeros(n, n_channels, device=device)
         if train.prune:
-            # m̂ = .73: from 3 a short training closes no mask
+            # m̂ starts at .73: from a logit of 3 a short training closes none
             self.raw["prune_logits"] = torch.full((n,), 1.0, device=device)
         if train.sh_prune and train.sh_degree > 0:
             self.raw["sh_logits"] = torch.zeros(n, 3, device=device)

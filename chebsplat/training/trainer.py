@@ -116,7 +116,10 @@ class Trainer:
         # whose regions need finite Gaussians
         if growing or due or isinstance(self.model, PrintedScene):
             self._drop_broken()
-        mask = self._soft_mask(share) if removing else None
+        mask = None
+        if removing and self.schedule.prunes(share):
+            with torch.no_grad():
+                mask = self.model.soft_mask()
         if growing:
             self.population.grow(self.optimizer, self.members, self.generator)
         if removing:
@@ -134,13 +137,6 @@ class Trainer:
             self.refresh()
         elif names := broken(self.model):
             raise DataFailure(f"step {self.step}: the training has broken down; {names}")
-
-    @torch.no_grad()
-    def _soft_mask(self, share: float) -> Tensor | None:
-        """Of all Gaussians, once pruning has begun."""
-        if not self.schedule.prunes(share):
-            return None
-        return self.model.soft_mask()
 
     def state_dict(self) -> dict[str, Any]:
         """All that the steps to come depend on: tensors (shared, not copied) and plain values."""

@@ -33,8 +33,8 @@ HOMOGRAPHIES = {
     for name in ("PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC")
 }
 SCARCE = 60  # points of the median photo
-# span of the middle 80 % of the photos' own focal lengths, in ln: of two lenses .3; of a zoom that
-# goes by a third .24, where own focal lengths leave 2 to 4 cm in a room, one lens 1
+# of `focal_spread`: of two lenses .3; of a zoom that goes by a third .24, where own focal lengths
+# leave errors of 2 to 4 cm in a room; through one lens they are 1 cm
 ZOOMED = 0.1
 LOOSE = 1.5e-3  # of the longer side: a reprojection error of 2.4 pixels in 1,600
 REMEDY = (
@@ -164,12 +164,14 @@ def judge_model(
     n_misplaced: int,
     mapped_error: float,
     focal_spread: float,
+    own_focals: bool,
 ) -> dict[str, Any]:
     """Figures by which to judge a model, and its `doubts` in words.
 
     Args: others: photos in each further model, which share nothing with this one; n_misplaced: left
       out of it; mapped_error: reprojection error, pixels, before outliers were removed;
-      focal_spread: of the photos' own focal lengths, as ZOOMED is.
+      focal_spread: span of the middle 80 % of the photos' own focal lengths, ln; own_focals: the
+      model has them.
     """
     images = [model.images[key] for key in graph.images if model.images[key].has_pose]
     side = max(max(camera.width, camera.height) for camera in model.cameras.values())
@@ -187,6 +189,7 @@ def judge_model(
         "reprojection_error": float(model.compute_mean_reprojection_error() / side),
         "mapped_error": float(mapped_error / side),
         "focal_spread": focal_spread,
+        "own_focals": own_focals,
         "pairs_agree": graph.n_agree / max(len(graph.rows), 1),
         "pairs_level": graph.level,
         "angle_degrees": angle(
@@ -238,8 +241,9 @@ def doubts(facts: dict[str, Any]) -> list[str]:
         )
     if facts["focal_spread"] > ZOOMED:
         messages.append(
-            f"Focal lengths of the photos differ by {math.expm1(facts['focal_spread']):.0%}, which "
-            "makes poses less exact: lock focus and zoom, or make a scene of each lens."
+            f"Focal lengths of the photos differ by {math.expm1(facts['focal_spread']):.0%}, "
+            f"{'which makes poses less exact' if facts['own_focals'] else 'where one is assumed'}: "
+            "lock focus and zoom, or make a scene of each lens."
         )
     if facts["points_a_view"] < SCARCE:
         messages.append(

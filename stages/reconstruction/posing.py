@@ -46,7 +46,8 @@ INIT_ANGLES = 16.0, 2.0
 # error stays; through a zoom that goes by 5 % .03, to .94, and cameras lie 1 to 2 cm nearer. Of
 # three real captures one spans .026, to .97.
 ONE_LENS, CLEARER = 0.02, 0.96
-KEPT, WILD = 0.98, 0.7  # of the points, at least; in ln, which no photo's focal length differs by
+KEPT = 0.98  # of the observations, which stay at least
+WILD = 0.7  # in ln: where the focal length of any photo differs by more, none has its own
 # distortion terms of camera models
 LENSES = {"SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "OPENCV": 4, "OPENCV_FISHEYE": 4}
 
@@ -150,8 +151,9 @@ def _mapped(
     _refine(model)
     own = _with_own_focals(model)
     ratios = _focal_ratios(own, model)
-    low, high = np.quantile(ratios, (0.1, 0.9))
-    if high - low > ONE_LENS and _fits_better(own, model) and np.abs(ratios).max() < WILD:
+    sane = np.abs(ratios) < WILD
+    low, high = np.quantile(ratios[sane], (0.1, 0.9)) if sane.any() else (0.0, 0.0)
+    if high - low > ONE_LENS and sane.all() and _fits_better(own, model):
         model = own
     sizes = [other.num_reg_images() for other in others]
     judged = judge.judge_model(
@@ -162,6 +164,7 @@ def _mapped(
         len(misplaced),
         mapped_error,
         float(high - low),
+        model is own,
     )
     return _collected(model, shots, judged)
 
@@ -321,7 +324,7 @@ def _focal_ratios(own: pycolmap.Reconstruction, model: pycolmap.Reconstruction) 
         if image.has_pose
     ]
     ratios = [
-        max(camera.mean_focal_length(), 1e-9) / shared.mean_focal_length()
+        max(camera.mean_focal_length() / shared.mean_focal_length(), 1e-9)
         for camera, shared in pairs
         if shared.focal_length_idxs()
     ]
@@ -329,9 +332,9 @@ def _focal_ratios(own: pycolmap.Reconstruction, model: pycolmap.Reconstruction) 
 
 
 def _fits_better(own: pycolmap.Reconstruction, model: pycolmap.Reconstruction) -> bool:
-    """True where own focal lengths lower the error to CLEARER, and not by losing points."""
+    """True where own focal lengths lower the error to CLEARER, and not by losing observations."""
     most = CLEARER * model.compute_mean_reprojection_error()
-    kept = own.num_points3D() > KEPT * model.num_points3D()
+    kept = own.compute_num_observations() > KEPT * model.compute_num_observations()
     return bool(kept and own.compute_mean_reprojection_error() < most)
 
 

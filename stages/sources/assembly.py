@@ -41,7 +41,7 @@ from chebsplat.stages.sources.pictures import (
 WORKERS = 4
 MOST_EMPTY = 1 / 3  # of the views that see a point
 OWN_SIDE = 1600  # pixels: size limit of photos as taken, as in published comparisons
-MOST_CUT = 0.03  # of a view's width and height, to make views as large as others
+MOST_CUT = 0.03  # of a side of views of photos alone, to make them as large as others
 COMPARED = 8  # views whose variance is compared with their photos'
 
 
@@ -52,7 +52,8 @@ def assemble(
 
     Choices: `max_views` picks evenly from the naturally sorted frames. Images are reduced to
       `max_side` by averaging, and undistorted in the same step where a lens bends them
-      (`resampled`); depth, labels and masks take the nearest pixel of the file. Smaller views are
+      (`resampled`); depth, labels and masks take the nearest pixel of the file. Of photos alone,
+      whose lenses were found, views of almost one size are cut to one; other smaller views are
       padded at the right and the bottom, where the loss mask is false, as in a photo that is all
       transparent. Depth is used only if every frame of the source has it; pixels of a frame without
       labels have none.
@@ -60,7 +61,8 @@ def assemble(
       name.
     """
     frames, notes = choose_frames(listing, settings)
-    shapes = geometries([frame.camera for frame in frames], settings.max_side)
+    most_cut = MOST_CUT if listing.kind == "photos" else 0.0
+    shapes = geometries([frame.camera for frame in frames], settings.max_side, most_cut)
     full = (
         len(frames),
         max(shape.height for shape in shapes),
@@ -303,12 +305,15 @@ def faces(frame: Frame) -> list[Frame]:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """A photo's pinhole view: K [3, 3], size in its pixels; factor: its pixels per photo pixel."""
+    """A photo's pinhole view: K [3, 3], size in its pixels; factor: its pixels per photo pixel;
+    whole: (width, height) before it was cut at the right and the bottom.
+    """
 
     K: np.ndarray
     width: int
     height: int
     factor: float
+    whole: tuple[int, int]
 
 
 def geometry(camera: Camera, max_side: int) -> Geometry:
@@ -320,25 +325,23 @@ def geometry(camera: Camera, max_side: int) -> Geometry:
     K = np.array(
         [[fx * w / width, 0, cx * w / width], [0, fy * h / height, cy * h / height], [0, 0, 1.0]]
     )
-    return Geometry(K, w, h, factor)
+    return Geometry(K, w, h, factor, (w, h))
 
 
-def geometries(
-    cameras: Sequence[Camera], max_side: int, most_cut: float = MOST_CUT
-) -> list[Geometry]:
-    """The views of photos; where lenses are almost alike, those of one photo size are of one size.
+def geometries(cameras: Sequence[Camera], max_side: int, most_cut: float) -> list[Geometry]:
+    """The views of photos; of one photo size, those that are smaller than the largest by at most
+    `most_cut` of a side are cut to the smallest of these.
 
-    Choices: focal lengths of their own make undistorted sizes differ by pixels. All are cut at the
-      right and the bottom to the smallest, unless that costs more than `most_cut` of a side.
+    Choices: where photos have focal lengths of their own, undistorted sizes differ by pixels.
     """
     shapes = {camera: geometry(camera, max_side) for camera in set(cameras)}
     for photo in {(camera.width, camera.height) for camera in shapes}:
         alike = [camera for camera in shapes if (camera.width, camera.height) == photo]
         sizes = np.array([[shapes[camera].width, shapes[camera].height] for camera in alike])
-        if (sizes.min(0) >= (1 - most_cut) * sizes.max(0)).all():
-            width, height = sizes.min(0).tolist()
-            for camera in alike:
-                shapes[camera] = replace(shapes[camera], width=width, height=height)
+        near = (sizes >= (1 - most_cut) * sizes.max(0)).all(1)
+        for k in np.flatnonzero(near):
+            width, height = sizes[near].min(0).tolist()
+            shapes[alike[k]] = replace(shapes[alike[k]], width=width, height=height)
     return [shapes[camera] for camera in cameras]
 
 
@@ -348,8 +351,8 @@ def positions(camera: Camera, view: Geometry) -> np.ndarray:
     Choices: -1 beyond the radius at which a distortion polynomial is no longer monotonic.
     """
     if camera.model not in DISTORTED:
-        x = (np.arange(view.width) + 0.5) * camera.width / view.width
-        y = (np.arange(view.height) + 0.5) * camera.height / view.height
+        x = (np.arange(view.width) + 0.5) * camera.width / view.whole[0]
+        y = (np.arange(view.height) + 0.5) * camera.height / view.whole[1]
         return np.stack(np.meshgrid(x, y))
     grid = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     pixels = np.stack([*grid, np.ones((view.height, view.width))], -1).reshape(-1, 3)
@@ -473,8 +476,9 @@ def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.
       as the photo's, the value at its centre.
     """
     if camera.model not in DISTORTED:
-        size = (view.width, view.height)
-        return np.asarray(image if size == image.size else image.resize(size, Image.Resampling.BOX))
+        same = view.whole == image.size
+        whole = np.asarray(image if same else image.resize(view.whole, Image.Resampling.BOX))
+        return whole[: view.height, : view.width]
 
     scale = min(2 * view.factor, 1.0)
     size = (max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))

@@ -80,32 +80,35 @@ def read(path: Path, settings: IngestSection, model: PhotoModel) -> dict[str, An
     if settings.max_views is not None and settings.max_views < len(rows):
         rows = np.linspace(0, len(rows) - 1, settings.max_views).round().astype(int)
         notes.append(f"{len(rows)} of {len(model.names)} views are used (ingest.max_views).")
-    lenses = [cameras.camera_of(file, *camera) for camera in model.cameras]
+    lenses = [cameras.camera_of(file, *model.cameras[k]) for k in model.camera[rows]]
     shapes = assembly.geometries(lenses, settings.max_side, most_cut=1)  # frames are one stack
     if (least := min(shape.factor for shape in shapes)) < 1:
         notes.append(f"Images are reduced by {least:.3f} (ingest.max_side).")
-    row_of = {model.frames[row]: row for row in rows}
+    names = [model.names[row] for row in rows]
+    view_of = {model.frames[row]: view for view, row in enumerate(rows)}
     lookup = functools.lru_cache(1)(assembly.positions)
     images, shares, step = [], [], max(len(rows) // assembly.COMPARED, 1)
-    for k, (frame, image) in enumerate(_read_frames(file, set(row_of))):
-        lens = lenses[model.camera[row_of[frame]]]
-        view = shapes[model.camera[row_of[frame]]]
-        at = lookup(lens, view)
-        images.append(assembly.resampled(image, lens, view, at))
-        if k % step == 0:
+    for frame, image in _read_frames(file, set(view_of)):
+        view = view_of[frame]
+        at = lookup(lenses[view], shapes[view])
+        images.append(assembly.resampled(image, lenses[view], shapes[view], at))
+        if view % step == 0:
             shares.append(assembly.variance_kept(image, images[-1], at))
 
-    def altered(names: set[str]) -> Iterator[tuple[str, cameras.Camera, Any]]:
-        changed = lenses[0].model in cameras.DISTORTED or least < 1
-        numbers = {frame for frame, row in row_of.items() if model.names[row] in names and changed}
-        for frame, image in _read_frames(file, numbers):
-            row = row_of[frame]
-            yield model.names[row], lenses[model.camera[row]], image
+    def altered(asked: set[str]) -> Iterator[tuple[str, cameras.Camera, Any]]:
+        changed = {
+            frame
+            for frame, view in view_of.items()
+            if names[view] in asked
+            and (lenses[view].model in cameras.DISTORTED or shapes[view].factor < 1)
+        }
+        for frame, image in _read_frames(file, changed):
+            yield names[view_of[frame]], lenses[view_of[frame]], image
 
     fields = {
-        "names": [model.names[row] for row in rows],
+        "names": names,
         "images": np.stack(images),
-        "Ks": np.stack([shapes[camera].K for camera in model.camera[rows]]),
+        "Ks": np.stack([shape.K for shape in shapes]),
         "cam_from_world": model.cam_from_world[rows],
         "source": {"kind": "video", "notes": notes},
         "altered": altered,

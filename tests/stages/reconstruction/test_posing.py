@@ -38,7 +38,7 @@ GOOD = {
     "n_registered": 20, "n_given": 20, "n_in_others": [], "n_misplaced": 0, "n_points": 4000,
     "points_a_view": 400.0,
     "track_length": 4.0, "reprojection_error_px": 0.5, "reprojection_error": 4e-4,
-    "mapped_error": 5e-4, "focal_spread": 0.01,
+    "mapped_error": 5e-4, "focal_spread": 0.01, "own_focals": False,
     "pairs_agree": 0.95, "pairs_level": 0.1, "angle_degrees": 15.0,
 }  # fmt: skip
 
@@ -223,15 +223,16 @@ def test_photos_whose_focal_lengths_differ_have_their_own(zoom, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("error", "n_points", "better"), [(0.9, 99, True), (0.99, 100, False), (0.5, 90, False)]
+    ("error", "n_observations", "better"), [(0.9, 99, True), (0.99, 100, False), (0.5, 90, False)]
 )
-def test_own_focal_lengths_are_better_where_points_fit_and_stay(error, n_points, better):
-    def model(error, n_points):
+def test_own_focal_lengths_are_better_where_points_fit_and_stay(error, n_observations, better):
+    def model(error, n_observations):
         return SimpleNamespace(
-            compute_mean_reprojection_error=lambda: error, num_points3D=lambda: n_points
+            compute_mean_reprojection_error=lambda: error,
+            compute_num_observations=lambda: n_observations,
         )
 
-    assert posing._fits_better(model(error, n_points), model(1.0, 100)) == better
+    assert posing._fits_better(model(error, n_observations), model(1.0, 100)) == better
 
 
 @pytest.mark.parametrize(
@@ -273,7 +274,8 @@ def test_mapping_begins_again_where_few_register_and_counts_where_more_pairs_agr
         ),
         ({"pairs_agree": 0.5}, "Only 50% of the pairs"),
         ({"mapped_error": 3e-3}, "lock focus and zoom"),
-        ({"focal_spread": 0.2}, "Focal lengths of the photos differ by 22%"),
+        ({"focal_spread": 0.2}, "Focal lengths of the photos differ by 22%, where one is assumed"),
+        ({"focal_spread": 0.2, "own_focals": True}, "which makes poses less exact"),
         ({"points_a_view": 30.0}, "only 30 points"),
     ],
 )

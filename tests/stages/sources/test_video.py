@@ -128,7 +128,7 @@ def test_each_frame_is_undone_of_its_own_lens(tmp_path, monkeypatch):
     model.cameras = [["SIMPLE_RADIAL", [f, 80.0, 60.0, -0.1], 160, 120] for f in (150.0, 180.0)]
     fields = video.read(tmp_path / "a.mp4", IngestSection(), model)
     lenses = [Camera(*camera[:1], tuple(camera[1]), *camera[2:]) for camera in model.cameras]
-    views = assembly.geometries(lenses, 640)
+    views = assembly.geometries(lenses, 640, most_cut=1)
     for k, (lens, view) in enumerate(zip(lenses, views, strict=True)):
         assert (fields["Ks"][k] == view.K).all() and view.K[0, 0] == lens.params[0]
         at = assembly.positions(lens, view)
@@ -139,18 +139,30 @@ def test_each_frame_is_undone_of_its_own_lens(tmp_path, monkeypatch):
     assert [(name, lens.params) for name, lens, _ in taken] == [("b", lenses[1].params)]
 
 
-@pytest.mark.parametrize(("lens", "cut"), [((440.0, -0.05), True), ((400.0, -0.2), False)])
+@pytest.mark.parametrize(
+    ("lens", "cut"), [((440.0, -0.05), True), ((440.0, 0.0), True), ((400.0, -0.2), False)]
+)
 def test_views_through_almost_the_same_lens_are_of_one_size(lens, cut):
     lenses = [
         Camera("SIMPLE_RADIAL", (focal, 400.0, 300.0, term), 800, 600)
+        if term
+        else Camera("SIMPLE_PINHOLE", (focal, 400.0, 300.0), 800, 600)
         for focal, term in ((400.0, -0.05), lens)
     ]
     own = [assembly.geometry(lens, 800) for lens in lenses]
-    found = assembly.geometries(lenses, 800)
+    found = assembly.geometries(lenses, 800, most_cut=0.05)
     assert (own[0].width, own[0].height) != (own[1].width, own[1].height)
     assert ((found[0].width, found[0].height) == (found[1].width, found[1].height)) == cut
     for mine, view in zip(own, found, strict=True):
         assert (mine.K == view.K).all() and view.width <= mine.width and view.height <= mine.height
+    at, whole = assembly.positions(lenses[1], found[1]), assembly.positions(lenses[1], own[1])
+    assert np.allclose(at, whole[:, : found[1].height, : found[1].width])
+    photo = Image.fromarray(np.tile(np.arange(800, dtype=np.uint8)[:, None], (600, 1, 3)))
+    cut_view, view = (
+        assembly.resampled(photo, lenses[1], of, at_of)
+        for of, at_of in ((found[1], at), (own[1], whole))
+    )
+    assert (cut_view == view[: found[1].height, : found[1].width]).all()
 
 
 @pytest.mark.parametrize(
