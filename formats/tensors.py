@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import lzma
 import math
+import threading
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError
@@ -28,6 +29,7 @@ from chebsplat.formats.manifest import Manifest, remedy_of
 
 Spec = tuple[Any, ...]  # of an array: its dtype, then its sizes
 LARGEST = 256 << 20  # bytes of all requested arrays, unpacked
+_PARSING = threading.Lock()  # of headers: threads that parse at once fail now and then (3.11)
 # raised by numpy and zipfile; RuntimeError is an unknown compression
 _BROKEN = (OSError, ValueError, EOFError, RuntimeError, MemoryError, KeyError, TypeError,
            zipfile.BadZipFile, zlib.error, lzma.LZMAError, tokenize.TokenError)  # fmt: skip
@@ -117,7 +119,7 @@ def _readable(path: Path, kind: str, remedy: str) -> Iterator[None]:
         raise InputError(f"{path} is not a readable {kind} ({line}); {remedy}") from None
 
 
-def _array(handle: IO[bytes], size: int, largest: int) -> np.ndarray:
+def _array(handle: Any, size: int, largest: int) -> np.ndarray:
     """The array at the handle of a file (or zip member) of `size` bytes. Raises ValueError."""
     version = np.lib.format.read_magic(handle)
     read_header: Any = (
@@ -125,7 +127,8 @@ def _array(handle: IO[bytes], size: int, largest: int) -> np.ndarray:
         if version == (1, 0)
         else np.lib.format.read_array_header_2_0
     )
-    shape, _, dtype = read_header(handle)
+    with _PARSING:
+        shape, by_columns, dtype = read_header(handle)
     if dtype.hasobject:
         raise ValueError("it holds pickled objects, which are not read")
     declared = math.prod(shape) * dtype.itemsize
@@ -135,5 +138,7 @@ def _array(handle: IO[bytes], size: int, largest: int) -> np.ndarray:
         )
     if declared > largest:
         raise ValueError(f"it holds {declared:,} bytes, at most {largest:,} are read")
-    handle.seek(0)
-    return np.lib.format.read_array(handle, allow_pickle=False)
+    values = np.empty(shape[::-1] if by_columns else shape, dtype)
+    if declared and handle.readinto(values.reshape(-1).view(np.uint8)) != declared:
+        raise ValueError("it is cut short")
+    return values.T if by_columns else values

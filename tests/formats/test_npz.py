@@ -19,6 +19,13 @@ def npy(array, **header):
     return held.getvalue() + array.tobytes()
 
 
+@pytest.mark.parametrize("values", [np.zeros((0, 3)), np.array(3), np.arange(4, dtype="f2") > 1])
+def test_empty_arrays_and_single_values_come_back(values, tmp_path):
+    np.save(tmp_path / "a.npy", values)
+    found = read_npy(tmp_path / "a.npy", "copy it again")
+    assert (found.shape, found.dtype) == (values.shape, values.dtype) and (found == values).all()
+
+
 def test_arrays_come_back(tmp_path):
     names, rows = np.array(["wall", "sofa"]), np.asfortranarray(np.arange(6.0).reshape(2, 3))
     np.savez_compressed(tmp_path / "a.npz", names=names, rows=rows, other=np.zeros(3))
