@@ -133,9 +133,6 @@ class TrainSection(Section):
     densify: Literal["mixed", "region", "classic", "off"] = setting(
         "mixed", "where Gaussians grow; mixed: region and classic by turns"
     )
-    densify_semantic: bool = setting(
-        True, "false: the rendering loss alone says where Gaussians grow"
-    )
     grow_threshold: float = number(
         1e-4, "gradient to the 2D means that grows a Gaussian, half image widths", 1e-12, 1e3
     )

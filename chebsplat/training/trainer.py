@@ -58,8 +58,10 @@ class Trainer:
         self.optimizer = optimizer_of(self.model, self.settings, self.extent)
         self.order_generator = np.random.default_rng(settings.seed)
         self.generator = torch.Generator().manual_seed(settings.seed)
+        # where Gaussians grow, the printed method's Table 5 has a row without semantics
+        self.grows_by_color = settings.without == "pruning guidance"
         # a recording has one pass backward
-        model.replay = Replay(model.replay.records and settings.densify_semantic)
+        model.replay = Replay(model.replay.records and not self.grows_by_color)
         if isinstance(model, PrintedScene):
             model.draws = self.generator
         self.order: list[int] = []  # views still to be seen before any is seen again
@@ -176,7 +178,6 @@ class Trainer:
         self.laps.mark("refresh")
 
     def _step(self, index: int, share: float) -> dict[str, float | Tensor]:
-        settings = self.settings
         rendered, losses = self.losses_of(index, share, self._window(share))
         loss, values = losses["loss"], torch.stack([value.detach() for value in losses.values()])
         figures = dict(zip(losses, values.tolist() if self.reads else values.unbind(), strict=True))
@@ -193,13 +194,13 @@ class Trainer:
             )
         self.laps.mark("losses")
         self.optimizer.zero_grad(set_to_none=True)
-        if settings.densify_semantic:
-            loss.backward()
-            self.population.note_gradients(rendered)
-        else:
+        if self.grows_by_color:
             losses["loss_color"].backward(retain_graph=True)
             self.population.note_gradients(rendered)
             (loss - losses["loss_color"]).backward()
+        else:
+            loss.backward()
+            self.population.note_gradients(rendered)
         self.laps.mark("backward")
         self.optimizer.step()
         self.population.bound_scales()
@@ -304,7 +305,7 @@ class Trainer:
             )
             losses["depth"] = self.weight_depth * distance
         loss = torch.stack(list(losses.values())).sum()
-        if settings.densify_semantic:  # no gradient of one alone is needed
+        if not self.grows_by_color:  # no gradient of one alone is needed
             losses = {name: value.detach() for name, value in losses.items()}
         return {"loss": loss} | {f"loss_{name}": value for name, value in losses.items()}
 

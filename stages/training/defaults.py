@@ -133,7 +133,6 @@ DEFAULTS = {  # in this order: a later one may depend on an earlier
 
 WITHOUT: dict[str, dict[str, Any]] = {  # rows of Table 5 that are settings of the trainer
     "densification": {"densify": "off"},
-    "pruning guidance": {"densify_semantic": False},
 }
 
 

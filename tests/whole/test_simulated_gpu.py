@@ -97,7 +97,7 @@ def test_the_simulation_has_the_rules_of_torch(gpu):
         {"densify": "mixed"},
         {"densify": "region", "feature_every": 1},
         {"densify": "classic"},
-        {"semantics": False, "densify_semantic": False},
+        {"semantics": False},
     ],
     ids=["defaults", "regions", "classic", "colour alone"],
 )

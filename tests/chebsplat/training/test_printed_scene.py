@@ -53,7 +53,7 @@ def test_a_row_of_table_5_leaves_out_one_thing(without):
     assert isinstance(parts.encoder, kind)
     assert (parts.pruning is None) == (without == "pruning guidance")
     assert (parts.band_masks is None) == (without == "SH guidance")
-    assert made.settings.densify_semantic == (without != "pruning guidance")
+    assert made.grows_by_color == (without == "pruning guidance")
     assert (made.settings.densify == "off") == (without == "densification")
     described = made.model.whole().descriptors
     assert bool(described.any()) == (without != "descriptor")
