@@ -26,6 +26,9 @@ class Stage:
       facts of a scene (`pipelines.planning.forecast.SceneFacts`): fitted to generated rooms, fox,
       redkitchen, house_kitchen and seven captures of photos at 640 to 1600 pixels, within a factor
       of 1.5 for most. A machine corrects the seconds by those of its own scenes.
+    memory: MB that its process has at most on a CPU, by the same facts: fitted to office0, fox,
+      redkitchen and house_kitchen, and to 50 and 100 photos of 1600 pixels. A user's teacher and
+      more than 40,000 Gaussians were not measured.
     minutes, mem_mb: what a job requests of a cluster, ten times the longest measured time and three
       times the memory: a job that requests too little is lost, one that requests too much starts a
       little later; the memory is doubled at each retry. Measured in 18 scenes on two EPYC cores:
@@ -48,6 +51,7 @@ class Stage:
     of_protocol: bool = False  # runs the module of `ingest.protocol`, which is in the key then
     seconds: Callable[[Any], float] = lambda _: 1.0
     megabytes: Callable[[Any], float] = lambda _: 0.0
+    memory: Callable[[Any], float] = lambda _: 700.0
     minutes: int = 5
     mem_mb: int = 4000
 
@@ -83,6 +87,7 @@ STAGES: dict[str, Stage] = {
               seconds=lambda k: 0.5 + 2.4 * k.trained if k.kind == "generated"
               else 0.5 + 0.03 * k.raw + 0.4 * k.trained,
               megabytes=lambda k: 2.7 * k.trained, minutes=10, mem_mb=2000,  # 21, 49; 306 MB
+              memory=lambda k: 200 + 3.6 * k.trained + 1130 * k.trained / k.photos,
               help="Read a source into a capture: images, cameras and, where given, depth and "
                    "labels."),
         Stage("sfm", "chebsplat.points/2", ("sfm",), (("capture", "ingest"),),
@@ -92,6 +97,7 @@ STAGES: dict[str, Stage] = {
               if k.kind in ("photos", "video")
               else 0.5 + {"transforms": 1.0, "seven_scenes": 2.6}.get(k.kind, 0.3) * k.trained,
               megabytes=lambda k: 2.3, minutes=100,  # 5 with depth; 295 MB
+              memory=lambda k: 650 + 4.4 * k.trained,
               help="Cameras and points with normals and local anisotropic covariances."),
         Stage("channels", "chebsplat.channels/2", ("channels",),
               seconds=lambda k: 0.1, minutes=10, mem_mb=2000,  # 18, 48
@@ -112,7 +118,7 @@ STAGES: dict[str, Stage] = {
               help="The encoder of shape that scenes start from, taught over generated rooms."),
         Stage("describe", "chebsplat.descriptors/2", ("describe",),
               (("capture", "ingest"), ("points", "sfm")),
-              seconds=lambda k: 3.0, megabytes=lambda k: 19,
+              seconds=lambda k: 3.0, megabytes=lambda k: 19, memory=lambda k: 1050,
               help="Anisotropic Chebyshev descriptors of the surface's points at four radii "
                    "(Eqs 1-6)."),
         Stage("encode", "chebsplat.encoding/1", (),
@@ -140,6 +146,7 @@ STAGES: dict[str, Stage] = {
               device_packages=("gsplat",),
               seconds=lambda k: k.clock or 3 + k.step * k.steps,
               megabytes=lambda k: (14 if k.semantic else 8) * k.gaussians / 40_000,
+              memory=lambda k: 520 + 5 * k.trained + 100 * k.semantic + 80 * k.gaussians / 40_000,
               minutes=15,  # plus the time of its steps: 80, 239 for 3000; 693 MB
               help="Train the semantic Gaussian scene (Eqs 11-13)."),
         Stage("lift", "chebsplat.lifted/2", ("lift",),
@@ -165,6 +172,8 @@ STAGES: dict[str, Stage] = {
               (("features", "teacher"),), on_device=True, device_packages=("gsplat",),
               of_protocol=True, seconds=lambda k: 1 + 0.2 * k.trained,
               megabytes=lambda k: 0.5 * k.trained, mem_mb=2000,  # 5, 27; 646 MB
+              # photos as they were taken, of up to 1600 pixels
+              memory=lambda k: 530 + 1.2 * k.trained + 580 * min(k.raw / k.photos, 1.44),
               help="Measure the exported scene on the test views."),
         Stage("report", "chebsplat.report/1", (),
               (("evaluation", "evaluate"), ("gaussians", "train")),

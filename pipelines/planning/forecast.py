@@ -1,5 +1,5 @@
-"""Forecast of the seconds and megabytes of a plan: by photos, pixels and settings, corrected by the
-seconds of scenes that this machine has finished.
+"""Forecast of the seconds, megabytes and memory of a plan: by photos, pixels and settings, the
+seconds corrected by those of scenes that this machine has finished.
 """
 
 from __future__ import annotations
@@ -75,13 +75,15 @@ class SceneFacts:
 
 @dataclass(frozen=True)
 class Forecast:
-    """Seconds, by stage, and MB of the steps of one plan that are to run; saved: s that MANY of the
-    photos would spare where there are more.
+    """Of the steps of one plan that are to run: seconds, by stage, and MB that they write; memory:
+    MB that one of them has at most; saved: s that MANY of the photos would spare where there are
+    more.
     """
 
     photos: int
     seconds: dict[str, float]
     megabytes: float
+    memory: float
     saved: float = 0.0
 
     @property
@@ -217,7 +219,8 @@ def forecast(plan: Plan, steps: Iterable[Step], cores: int, device: str) -> Fore
     if "ingest" in stages and now.photos > MANY and (fewer := facts_of(sections, semantic, MANY)):
         saved = sum(expected.values()) - sum(seconds(fewer).values())
     size = sum(STAGES[stage].megabytes(now) for stage in stages)
-    return Forecast(now.photos, expected, size, saved)
+    memory = max((STAGES[stage].memory(now) for stage in stages), default=0.0)
+    return Forecast(now.photos, expected, size, memory, saved)
 
 
 def sentence(plan: Plan, expected: Forecast | None, cores: int, device: str) -> str:
@@ -228,7 +231,8 @@ def sentence(plan: Plan, expected: Forecast | None, cores: int, device: str) -> 
     text = f"{expected.photos} photos, "
     megabytes = max(round(expected.megabytes, -1), 10)
     text += (
-        f"about {duration(expected.total)} on {where}, {megabytes:.0f} MB"
+        f"about {duration(expected.total)} on {where}, {megabytes:.0f} MB, "
+        f"{expected.memory / 1000:.1f} GB of memory"
         if expected.seconds
         else "all is done"
     )

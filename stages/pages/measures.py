@@ -111,7 +111,9 @@ MEASURES: dict[str, tuple[Measure, ...]] = {  # by stage: its error is the first
 
 
 class Row(NamedTuple):
-    """A stage in the report's table: seconds, figures in words, and the machine they are of."""
+    """A stage in the report's table: seconds, figures in words, the machine they are of, its load,
+    and the most memory that a process of the stage has had.
+    """
 
     stage: str
     seconds: float
@@ -119,6 +121,7 @@ class Row(NamedTuple):
     figures: list[str]
     machine: str
     load: str
+    memory: str
 
 
 def figures_of(stage: str, facts: Mapping[str, dict[str, Any]]) -> list[str]:
@@ -137,15 +140,20 @@ def figures_of(stage: str, facts: Mapping[str, dict[str, Any]]) -> list[str]:
 def row_of(stage: str, manifest: Manifest, facts: Mapping[str, dict[str, Any]]) -> Row:
     """The row of a stage whose artifact this is."""
     processes = manifest.processes
-    machine, load = measured_on(manifest), ""
+    machine, load, memory = measured_on(manifest), "", ""
     if processes:
         cores = dict.fromkeys(str(process["cores"]) for process in processes)
         loads = [value for process in processes for value in process["load"]]
         machine += f" of {' and '.join(cores)} cores"
         load = f"{min(loads):.1f} to {max(loads):.1f}"
+        # absent in artifacts of earlier versions
+        if most := max(process.get("megabytes", 0) for process in processes):
+            memory = f"{most / 1000:.1f} GB"
     if len(processes) > 1:
         machine += f", in {len(processes)} processes"
-    return Row(stage, manifest.seconds, manifest.key, figures_of(stage, facts), machine, load)
+    return Row(
+        stage, manifest.seconds, manifest.key, figures_of(stage, facts), machine, load, memory
+    )
 
 
 class Course(NamedTuple):

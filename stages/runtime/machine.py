@@ -1,10 +1,12 @@
-"""Seconds, processor, cores, threads and load of each process that worked on an artifact."""
+"""Seconds, memory, processor, cores, threads, load of each process that worked on an artifact."""
 
 from __future__ import annotations
 
 import json
 import logging
 import os
+import resource
+import sys
 import time
 from dataclasses import dataclass, field
 from functools import cache
@@ -32,6 +34,13 @@ def processor() -> str:
     return str(get_host_cpu_name())
 
 
+def peak_megabytes() -> int:
+    """The most memory that this process has had, or one that it waited for, MB."""
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes of ru_maxrss
+    of = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return round(max(resource.getrusage(who).ru_maxrss for who in of) * unit / 1e6)
+
+
 def load() -> float:
     """Processes that wanted a core of the machine in the last minute, anyone's."""
     return round(os.getloadavg()[0], 2)
@@ -54,7 +63,7 @@ class Stopwatch:
         self.load = load()
 
     def processes(self) -> list[dict[str, Any]]:
-        """processor, gpu, cores, threads, load at start and now, and seconds of each process."""
+        """processor, gpu, cores, threads, load at start and now, seconds, peak MB of each."""
         of_machine = {
             "processor": processor(),
             "gpu": self.gpu,
@@ -62,7 +71,8 @@ class Stopwatch:
             "threads": self.threads,
         }
         seconds = round(time.perf_counter() - self.began, 3)
-        return [*self.earlier, of_machine | {"load": [self.load, load()], "seconds": seconds}]
+        spent = {"load": [self.load, load()], "seconds": seconds, "megabytes": peak_megabytes()}
+        return [*self.earlier, of_machine | spent]
 
     def keep(self, scratch: Path) -> None:
         """Write the processes so far beside a save in the scratch folder."""

@@ -60,7 +60,10 @@ MACHINE = {
 
 def test_a_row_tells_the_error_first_which_way_is_better_and_every_machine():
     facts = {"refined": {"labels_agree": 0.9, "gain": None, "right": 0.5}}
-    processes = [MACHINE, MACHINE | {"processor": "B", "cores": 4, "load": [0.1, 1.0]}]
+    processes = [
+        MACHINE | {"megabytes": 1240},
+        MACHINE | {"processor": "B", "cores": 4, "load": [0.1, 1.0], "megabytes": 310},
+    ]
     row = row_of("refine", Manifest("s/1", KEY, "refine", seconds=7.5, processes=processes), facts)
     assert row.figures == [
         "90.00% ↑ labels of half the training views that the other half reproduces",
@@ -68,14 +71,14 @@ def test_a_row_tells_the_error_first_which_way_is_better_and_every_machine():
     ]
     assert row[:3] == ("refine", 7.5, KEY)
     assert row.machine == "A, 2 threads and B, 2 threads of 8 and 4 cores, in 2 processes"
-    assert row.load == "0.1 to 2.0"
+    assert (row.load, row.memory) == ("0.1 to 2.0", "1.2 GB")
     bare = row_of("onnx", Manifest("s/1", KEY, "onnx"), {})
-    assert bare[3:] == ([], "a machine that was not recorded", "")
+    assert bare[3:] == ([], "a machine that was not recorded", "", "")
 
 
 def test_a_scene_s_course_is_its_stages_one_after_the_other_and_its_stops_are_read_off_it():
     rows = [
-        Row(*of, KEY, [], "", "")
+        Row(*of, KEY, [], "", "", "")
         for of in (("ingest", 10.0), ("teacher", 5.0), ("train", 40.0), ("lift", 5.0))
     ]
     # of 40: the rest is no step
