@@ -232,7 +232,7 @@ def sentence(plan: Plan, expected: Forecast | None, cores: int, device: str) -> 
     megabytes = max(round(expected.megabytes, -1), 10)
     text += (
         f"about {duration(expected.total)} on {where}, {megabytes:.0f} MB, "
-        f"{expected.memory / 1000:.1f} GB of memory"
+        f"about {expected.memory / 1000:.1f} GB of memory"
         if expected.seconds
         else "all is done"
     )

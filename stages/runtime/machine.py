@@ -35,7 +35,9 @@ def processor() -> str:
 
 
 def peak_megabytes() -> int:
-    """The most memory that this process has had, or one that it waited for, MB."""
+    """Peak memory, MB, of this process (on Linux also of its parent when it began), or of its
+    largest finished child, whichever is more.
+    """
     unit = 1 if sys.platform == "darwin" else 1024  # bytes of ru_maxrss
     of = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     return round(max(resource.getrusage(who).ru_maxrss for who in of) * unit / 1e6)

@@ -5,7 +5,6 @@ import os
 import shutil
 from dataclasses import asdict
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 from PIL import Image
@@ -18,7 +17,7 @@ from chebsplat.pipelines.planning.forecast import facts_of, forecast, sentence
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.work import store
 from chebsplat.stages.registry import STAGES
-from chebsplat.stages.runtime.machine import peak_megabytes, processor
+from chebsplat.stages.runtime.machine import processor
 from chebsplat.stages.sources.common import is_photo
 
 
@@ -135,15 +134,11 @@ MEMORY = [
     [pytest.param(*row, marks=[pytest.mark.data] if row[0] != "office0" else []) for row in MEMORY],
 )
 def test_forecast_memory_is_within_a_fifth_of_what_was_measured(scene, settings, megabytes):
+    if scene != "office0":
+        data(scene)
     plan, found = expected(scene, settings)
     assert found.memory == pytest.approx(megabytes, rel=0.2)
-    assert f", {found.memory / 1000:.1f} GB of memory" in sentence(plan, found, 2, "cpu")
-
-
-def test_a_process_tells_the_most_memory_that_it_has_had():
-    before = peak_megabytes()
-    block = np.ones(2 * 10**6 * max(before, 100) // 8)  # twice as much
-    assert len(block) and before < 1.9 * max(before, 100) < peak_megabytes()
+    assert f", about {found.memory / 1000:.1f} GB of memory" in sentence(plan, found, 2, "cpu")
 
 
 def test_a_training_that_reads_no_features_is_expected_to_be_one_of_colours():

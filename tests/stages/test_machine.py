@@ -39,6 +39,7 @@ def test_a_manifest_says_on_what_its_seconds_were_measured_and_its_key_does_not(
         assert (
             process["threads"] == manifest.threads and manifest.seconds == process["seconds"] >= 0
         )
+        assert process["megabytes"] > 50  # Python and NumPy
         assert len(process["load"]) == 2 and min(process["load"]) >= 0
         assert measured_on(manifest).startswith(f"{name}, {manifest.threads} thread")
     assert made[0].versions.keys() >= {"numpy", "python"}
