@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from chebsplat.splats.parts import first_of_each
 
 IGNORE = -1
-REACH = 3.0  # standard deviations
+REACH = 4.0  # standard deviations
 CELLS = 128  # along the longest side of what is measured
 CHUNK = 2048  # Gaussians at a time, so that their pairs with points stay in memory
 
@@ -112,23 +112,25 @@ def features_at(
     opacities: np.ndarray,
     features: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of the features of all Gaussians at each point, weighted by opacity times density
-    relative to its peak.
+    """Mean of the features of all Gaussians at each point, weighted by their densities there.
 
     Args:
       points:    [M, 3] scene units.
       means:     [N, 3]; quats [N, 4] wxyz of any length; scales [N, 3] standard deviations;
         opacities [N] in (0, 1).
       features:  [N, C].
-    Returns: features f32 [M, C], zero where no Gaussian reaches; weights f32 [M], their sums.
-    Choices: a Gaussian ends at 3 standard deviations. Nothing occludes anything: what lies in front
-      of a point or behind it by more than that does not count.
+    Returns: features f32 [M, C], zero where no Gaussian reaches; weights f64 [M], their sums.
+    Choices: a Gaussian's density is its opacity times the normal density, so that of one opacity a
+      small Gaussian says more of where it lies than a large one. It ends at 4 standard deviations.
+      Nothing occludes anything: what lies in front of a point or behind it by more than that does
+      not count.
     """
     sums, weights = np.zeros((len(points), features.shape[1])), np.zeros(len(points))
     if not len(points) or not len(means):
-        return sums.astype(np.float32), weights.astype(np.float32)
+        return sums.astype(np.float32), weights
     tree = cKDTree(points)
     axes = Rotation.from_quat(quats, scalar_first=True).as_matrix()
+    peaks = opacities / np.prod(scales, axis=1, dtype=np.float64)
     for start in range(0, len(means), CHUNK):
         rows = slice(start, start + CHUNK)
         near = tree.query_ball_point(means[rows], REACH * scales[rows].max(1))
@@ -140,12 +142,11 @@ def features_at(
             / scales[gaussian]
         )
         squared = (local**2).sum(1)
-        weight = np.where(squared <= REACH**2, opacities[gaussian] * np.exp(-0.5 * squared), 0.0)
+        weight = np.where(squared <= REACH**2, peaks[gaussian] * np.exp(-0.5 * squared), 0.0)
         matrix = coo_matrix((weight, (point, row)), (len(points), len(near))).tocsr()
         sums += matrix @ features[rows]
         weights += np.asarray(matrix.sum(1))[:, 0]
-    reached = np.maximum(weights, 1e-12)[:, None]
-    return (sums / reached).astype(np.float32), weights.astype(np.float32)
+    return (sums / np.where(weights > 0, weights, 1)[:, None]).astype(np.float32), weights
 
 
 def thinned(points: np.ndarray) -> np.ndarray:

@@ -28,9 +28,10 @@ def test_features_are_the_weighted_mean_over_all_gaussians():
     inverse = np.linalg.inv(np.einsum("nij,nj,nkj->nik", axes, scales**2, axes))
     away = points[:, None] - means
     squared = np.einsum("mni,nij,mnj->mn", away, inverse, away)
-    weight = np.where(squared <= REACH**2, opacities * np.exp(-squared / 2), 0)
+    peaks = opacities / scales.prod(1)
+    weight = np.where(squared <= REACH**2, peaks[None] * np.exp(-squared / 2), 0)
     found, weights = features_at(points, means, quats, scales, opacities, features)
-    assert np.abs(weights - weight.sum(1)).max() < 1e-4
+    np.testing.assert_allclose(weights, weight.sum(1), rtol=1e-6)
     reached = weights > 0
     assert 20 < reached.sum() < 280
     assert (
@@ -38,6 +39,14 @@ def test_features_are_the_weighted_mean_over_all_gaussians():
         < 1e-4
     )
     assert (found[~reached] == 0).all()
+
+
+def test_a_small_gaussian_says_more_of_its_place_than_one_a_hundred_times_as_large_about_it():
+    means, quats = np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1))
+    scales, opacities = np.array([[0.01] * 3, [1.0] * 3]), np.array([0.5, 0.9])
+    points = np.array([[0, 0, 0], [0.1, 0, 0]])  # the second lies beyond the small one
+    found, _ = features_at(points, means, quats, scales, opacities, np.eye(2))
+    assert found[0, 0] > 0.99 and found[1].tolist() == [0, 1]
 
 
 def test_a_point_beyond_every_gaussian_and_a_scene_of_none_have_no_weight():
