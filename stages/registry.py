@@ -106,7 +106,7 @@ STAGES: dict[str, Stage] = {
               (("channels", "channels"),), on_device=True,
               seconds=lambda k: 1.5 + 0.45 * k.trained if k.model else 0.5 + 0.1 * k.trained,
               megabytes=lambda k: (3 if k.model else 1) * k.trained,
-              minutes=15,  # 9, 66; 1088 MB
+              memory=lambda k: 1100, minutes=15,  # 9, 66
               help="Per-view semantic features of a 2D teacher."),
         Stage("agree", "chebsplat.agreement/2", ("agree",),
               (("capture", "ingest"), ("points", "sfm"), ("features", "teacher")),
@@ -159,7 +159,7 @@ STAGES: dict[str, Stage] = {
               (("gaussians", "train"), ("lifted", "lift")),
               (("capture", "ingest"), ("descriptors", "describe"), ("encoding", "encode"),
                ("features", "teacher"), ("knowledge", "recall")),
-              megabytes=lambda k: 4 * k.gaussians / 40_000,  # 9, 22; 1083 MB
+              megabytes=lambda k: 4 * k.gaussians / 40_000, memory=lambda k: 1100,  # 9, 22
               help="Blend the features of a finished scene with knowledge, and smooth them, as its "
                    "training views ask."),
         Stage("export", "chebsplat.scene/5", (), (("gaussians", "train"),),
@@ -172,8 +172,7 @@ STAGES: dict[str, Stage] = {
               (("features", "teacher"),), on_device=True, device_packages=("gsplat",),
               of_protocol=True, seconds=lambda k: 1 + 0.2 * k.trained,
               megabytes=lambda k: 0.5 * k.trained, mem_mb=2000,  # 5, 27; 646 MB
-              # photos as they were taken, of up to 1600 pixels
-              memory=lambda k: 530 + 1.2 * k.trained + 580 * min(k.raw / k.photos, 1.44),
+              memory=lambda k: 530 + 1.2 * k.trained + 580 * k.compared,
               help="Measure the exported scene on the test views."),
         Stage("report", "chebsplat.report/1", (),
               (("evaluation", "evaluate"), ("gaussians", "train")),

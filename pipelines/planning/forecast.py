@@ -23,7 +23,7 @@ from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.machine import processor
 from chebsplat.stages.runtime.progress import duration
 from chebsplat.stages.settings import FETCH
-from chebsplat.stages.sources.common import is_photo
+from chebsplat.stages.sources.common import OWN_SIDE, is_photo
 from chebsplat.stages.sources.generated import SIZES
 from chebsplat.stages.sources.video import MOST
 
@@ -42,9 +42,9 @@ class SceneFacts:
     """Facts of a scene before it is run.
 
     kind: of its source. raw, posed, trained: megapixels of all photos as they were taken, and as
-    `pose` and `ingest` reduce them. pairs: of photos that `pose` matches. steps, clock: of the
-    training, clock: s, None: as long as the steps take. gaussians: at most. model: a 2D teacher's
-    model is run.
+    `pose` and `ingest` reduce them; compared: of one as `evaluate` does. pairs: of photos that
+    `pose` matches. steps, clock: of the training, clock: s, None: as long as the steps take.
+    gaussians: at most. model: a 2D teacher's model is run.
     """
 
     kind: str
@@ -52,6 +52,7 @@ class SceneFacts:
     raw: float
     posed: float
     trained: float
+    compared: float
     pairs: int
     steps: int
     clock: float | None
@@ -119,6 +120,7 @@ def facts_of(
             n * area,
             n * area * min(1, pose.get("max_side", side) / side) ** 2,
             n * reduced,
+            area * min(1, OWN_SIDE / side) ** 2,
             n * (n - 1) // 2 if all_pairs else round(0.6 * pose.get("n_matched", 10) * n),
             train.get("steps") or default_steps(n_training * reduced * 1e6),
             train.get("seconds"),

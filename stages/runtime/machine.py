@@ -19,6 +19,7 @@ from chebsplat.kernels.threads import cores
 
 log = logging.getLogger("chebsplat")
 CPUS = Path("/proc/cpuinfo")  # which has no names on ARM
+STATUS = Path("/proc/self/status")
 PROCESSES = "processes.json"  # in the scratch folder of a stage that resumes
 
 
@@ -35,12 +36,14 @@ def processor() -> str:
 
 
 def peak_megabytes() -> int:
-    """Peak memory, MB, of this process (on Linux also of its parent when it began), or of its
-    largest finished child, whichever is more.
-    """
+    """Peak memory, MB, of this process or of its largest finished child, whichever is more."""
     unit = 1 if sys.platform == "darwin" else 1024  # bytes of ru_maxrss
     of = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    return round(max(resource.getrusage(who).ru_maxrss for who in of) * unit / 1e6)
+    own, of_child = (resource.getrusage(who).ru_maxrss * unit for who in of)
+    if STATUS.exists():  # Linux, whose ru_maxrss counts the parent when this process began
+        lines = STATUS.read_text(encoding="utf-8").splitlines()
+        own = next((1024 * int(s.split()[1]) for s in lines if s.startswith("VmHWM")), own)
+    return round(max(own, of_child) / 1e6)
 
 
 def load() -> float:

@@ -28,7 +28,7 @@ from chebsplat.stages.sources.cameras import (
     scaled,
     undistorted,
 )
-from chebsplat.stages.sources.common import Frame, Listing, distinct, natural
+from chebsplat.stages.sources.common import OWN_SIDE, Frame, Listing, distinct, natural
 from chebsplat.stages.sources.pictures import (
     DEEP,
     GREY,
@@ -40,7 +40,6 @@ from chebsplat.stages.sources.pictures import (
 
 WORKERS = 4
 MOST_EMPTY = 1 / 3  # of the views that see a point
-OWN_SIDE = 1600  # pixels: size limit of photos as taken, as in published comparisons
 MOST_CUT = 0.03  # of a side of views of photos alone, to make them as large as others
 COMPARED = 8  # views whose variance is compared with their photos'
 

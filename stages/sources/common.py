@@ -21,6 +21,7 @@ from chebsplat.formats.videos import is_video
 from chebsplat.stages.settings import SourceSection
 from chebsplat.stages.sources.cameras import Camera
 
+OWN_SIDE = 1600  # pixels: size limit of photos as taken, as in published comparisons
 # folders of label maps; the first that exists is read
 LABELS = (
     "semantic",
