@@ -157,6 +157,10 @@ class SfmSection(Section):
         "depth of a plane sweep of the photos; auto: where a fifth of their cells hold no point, "
         "and no depth is given",
     )
+    enclosure: Literal["auto", "off"] = setting(
+        "auto",
+        "walls, floor and ceiling continue where no photo looks; auto: with depth, of few photos",
+    )
     seed: int = seed("of the choice among points, and of the matches")
 
 

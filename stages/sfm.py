@@ -15,6 +15,7 @@ from chebsplat.labels.agreement import project
 from chebsplat.photos.colors import tell_of
 from chebsplat.splats.gaussians import local_shape
 from chebsplat.stages.reconstruction.dense import MOST, backdrop, covered, swept, wants_more
+from chebsplat.stages.reconstruction.enclosure import enclosed
 from chebsplat.stages.reconstruction.pose_check import wants_adjustment
 from chebsplat.stages.reconstruction.thinning import by_color, edge_of, thin
 from chebsplat.stages.reconstruction.triangulation import reconstruct
@@ -70,6 +71,7 @@ def run(job: Job) -> None:
         cloud = joined(cloud, behind) | {
             "notes": cloud["notes"] | {"n_behind": len(behind["means"])}
         }
+    cloud = with_sides(job, capture, cloud, use_poses or "poses_kept" in cloud["notes"])
     means = cloud["means"]
     covariances, normals = local_shape(means, N_NEIGHBORS)
     eye = centers(cloud["cam_from_world"])[cloud["seen_from"]]
@@ -88,6 +90,27 @@ def run(job: Job) -> None:
         cloud["notes"],
         depths,
     ).write(job.out)
+
+
+def with_sides(job: Job, capture: Capture, cloud: Cloud, in_unit: bool) -> Cloud:
+    """A cloud with points on the sides of its room where no training photo shows them.
+
+    Args: in_unit: the capture's depth, if any, is in the unit of the cloud.
+    """
+    row = {name: k for k, name in enumerate(capture.names)}
+    rows, depth = [row[name] for name in cloud["names"]], capture.depth
+    if job.config.sfm.enclosure == "off":
+        reason = "sfm.enclosure is off"
+    elif depth is None or not in_unit:
+        reason = "no measured depth tells what photos show"
+    else:
+        views = np.flatnonzero(~capture.is_test[rows])
+        sides, reason = enclosed(cloud, views, lambda k: depth[rows[k]], capture.size, N_NEIGHBORS)
+        if not reason:
+            n = len(sides["means"])
+            return joined(cloud, sides) | {"notes": cloud["notes"] | {"n_continued": n}}
+    job.left_out("sides of the room where no photo looks", reason)
+    return cloud
 
 
 def check_points(capture: Capture, cloud: Cloud) -> dict[str, float]:

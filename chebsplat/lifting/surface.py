@@ -26,11 +26,6 @@ N_PIXELS = 600_000  # that are looked at
 LEAST = 0.4
 # the same where photos were swept: coarser, and counted only where views agree
 EDGE_SWEPT, LEAST_SWEPT = 0.08, 0.2
-# directions, Gaussians that try them; cosine of 11 degrees
-N_TRIED, N_PLANES, PARALLEL = 400, 20_000, 0.98
-SQUARE = 0.2  # cosine, of directions at right angles
-FREE, SEATS = 0.1, 0.23  # of a room's extent: off its walls; off floor and ceiling
-LEVEL = 0.95  # cosine of a level surface's normal to up
 LOOKOUT_SIZE, LOOKOUT_ANGLE = (192, 144), 1.4  # pixels; rad, across
 
 
@@ -118,55 +113,6 @@ def lookouts(
             pose[:3, :3], pose[:3, 3] = rotation @ turn, -rotation @ eye
             poses.append(pose)
     return np.stack(poses), np.tile(K, (len(poses), 1, 1))
-
-
-def room_up(
-    means: np.ndarray, normals: np.ndarray, weights: np.ndarray
-) -> tuple[np.ndarray, float, float]:
-    """Up, unit [3], of the Gaussians of a room without cameras, and two signs that it is a room.
-
-    Args: means [N, 3]; normals [N, 3] unit, of any sign; weights [N], of the flat surface that each
-      stands for.
-    Returns: up; the share of the surface that lies across three directions at right angles; the
-      lean: in [0, 1], 0 where nothing tells up from down.
-    Choices: a room's directions are those that most of its surface lies across; along up, what
-      stands free of floor, ceiling and walls lies low, and so do level surfaces between floor and
-      ceiling (SEATS), without lamps and beams. Directions are tried at the normals of N_TRIED
-      Gaussians.
-    """
-    rng = np.random.default_rng(0)
-    share = weights / weights.sum()
-    tried = normals[rng.choice(len(means), N_TRIED, p=share)]
-    drawn = normals[rng.choice(len(means), min(len(means), N_PLANES), p=share)]
-    across = (np.abs(tried @ drawn.T) > PARALLEL).mean(1)
-    axes, shares, heights = [], [], []
-    for _ in range(3):
-        best = int(across.argmax())
-        shares.append(float(across[best]))
-        axis: np.ndarray = tried[best].astype(np.float64)
-        across[np.abs(tried @ tried[best]) > SQUARE] = 0
-        for _ in range(3):  # the mean of what is parallel to it, of either sign
-            here = np.abs(normals @ axis) > PARALLEL
-            axis = np.linalg.eigh((normals[here] * weights[here, None]).T @ normals[here])[1][:, -1]
-        low, high = np.quantile(means @ axis, (0.02, 0.98))
-        heights.append((means @ axis - low) / max(high - low, 1e-30))
-        axes.append(axis)
-
-    free = np.all([(h > FREE) & (h < 1 - FREE) for h in heights], 0)
-    leans = [lean(share, h, free) for h in heights]
-    best = int(np.argmax([s * (1 + 2 * of**2) for s, of in zip(shares, leans, strict=True)]))
-    up, height = axes[best], heights[best]
-    level = (np.abs(normals @ up) > LEVEL) & (height > SEATS) & (height < 1 - SEATS)
-    down = (leans[best] + lean(share, height, level)) / 2
-    return (up if down >= 0 else -up), sum(shares), abs(down)
-
-
-def lean(share: np.ndarray, height: np.ndarray, mask: np.ndarray) -> float:
-    """The part of the masked surface in the lower half less that in the upper one, in [-1, 1];
-    share [N]: of all surface that each Gaussian has.
-    """
-    total = float(share[mask].sum())
-    return (2 * float(share[mask & (height < 0.5)].sum()) - total) / max(total, 1e-30)
 
 
 def fused(points: np.ndarray, eyes: np.ndarray, edge: float, least: float = LEAST) -> Surface:

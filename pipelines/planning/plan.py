@@ -51,7 +51,14 @@ if TYPE_CHECKING:
 
 
 Overrides = str | Mapping[str, Any]  # `section.key=value,...`, or sections by name
-OFF_IS_CHOICE = ("ingest.depth", "sfm.dense", "train.densify", "train.exposure", "refine.smooth")
+OFF_IS_CHOICE = (
+    "ingest.depth",
+    "sfm.dense",
+    "sfm.enclosure",
+    "train.densify",
+    "train.exposure",
+    "refine.smooth",
+)
 
 
 @dataclass

@@ -8,14 +8,13 @@ import numpy as np
 from scipy.special import expit
 
 from chebsplat.cameras import common_up
-from chebsplat.lifting.surface import room_up
+from chebsplat.shape.room import LEAST_BOXED, room_up
 from chebsplat.splats.gaussians import surface_of
 
 log = logging.getLogger("chebsplat")
 
 LEAST_SURE = 0.5  # of `cameras.common_up`, below which the cameras are not upright
-# of `room_up`: 26 rooms have .45 and .32 at least, 12 other scenes .27 of the first at most
-LEAST_BOXED, LEAST_LEAN = 0.35, 0.2
+LEAST_LEAN = 0.2  # of `room_up`: 26 rooms have .32 at least
 Up = np.ndarray | str  # unit [3], or "auto"
 
 
