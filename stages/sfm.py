@@ -66,12 +66,12 @@ def run(job: Job) -> None:
             f"only {n} points were found, at least 16 are needed; add views with more overlap"
         )
     off = {} if "reprojection_error_px" in cloud["notes"] else check_points(capture, cloud)
+    cloud = with_sides(job, capture, cloud, use_poses or "poses_kept" in cloud["notes"])
     if depths is not None:
         behind = backdrop(capture, cloud)
         cloud = joined(cloud, behind) | {
             "notes": cloud["notes"] | {"n_behind": len(behind["means"])}
         }
-    cloud = with_sides(job, capture, cloud, use_poses or "poses_kept" in cloud["notes"])
     means = cloud["means"]
     covariances, normals = local_shape(means, N_NEIGHBORS)
     eye = centers(cloud["cam_from_world"])[cloud["seen_from"]]
@@ -98,17 +98,22 @@ def with_sides(job: Job, capture: Capture, cloud: Cloud, in_unit: bool) -> Cloud
     Args: in_unit: the capture's depth, if any, is in the unit of the cloud.
     """
     row = {name: k for k, name in enumerate(capture.names)}
-    rows, depth = [row[name] for name in cloud["names"]], capture.depth
+    rows, depth, mask = [row[name] for name in cloud["names"]], capture.depth, capture.loss_mask
     if job.config.sfm.enclosure == "off":
         reason = "sfm.enclosure is off"
     elif depth is None or not in_unit:
-        reason = "no measured depth tells what photos show"
+        reason = "no depth in the unit of the scene tells what photos show"
     else:
+
+        def depth_of(k: int) -> np.ndarray:
+            """Depth of a view of the cloud, 0 where it is masked."""
+            return depth[rows[k]] if mask is None else np.where(mask[rows[k]], depth[rows[k]], 0)
+
         views = np.flatnonzero(~capture.is_test[rows])
-        sides, reason = enclosed(cloud, views, lambda k: depth[rows[k]], capture.size, N_NEIGHBORS)
+        sides, reason = enclosed(cloud, views, depth_of, capture.size)
         if not reason:
             n = len(sides["means"])
-            return joined(cloud, sides) | {"notes": cloud["notes"] | {"n_continued": n}}
+            return joined(cloud, sides) | {"notes": cloud["notes"] | {"n_on_sides": n}}
     job.left_out("sides of the room where no photo looks", reason)
     return cloud
 

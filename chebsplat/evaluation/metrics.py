@@ -119,7 +119,8 @@ def features_at(
       means:     [N, 3]; quats [N, 4] wxyz of any length; scales [N, 3] standard deviations;
         opacities [N] in (0, 1).
       features:  [N, C].
-    Returns: features f32 [M, C], zero where no Gaussian reaches; weights f64 [M], their sums.
+    Returns: features f32 [M, C], zero where no Gaussian reaches; weights f64 [M], their sums,
+      in scene units⁻³.
     Choices: a Gaussian's density is its opacity times the normal density, so that of one opacity a
       small Gaussian says more of where it lies than a large one. It ends at 4 standard deviations.
       Nothing occludes anything: what lies in front of a point or behind it by more than that does

@@ -1,4 +1,4 @@
-"""A room by its surfaces: the directions that these lie across, up, and its six sides."""
+"""A room by its surfaces: their three dominant normals, up, and the sides that it has."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ SQUARE = 0.2  # cosine, of directions at right angles
 FREE, SEATS = 0.1, 0.23  # of a room's extent: off its walls; off floor and ceiling
 LEAST_BOXED = 0.35  # of the shares of `room_axes`: 26 rooms have .45 at least, 12 other scenes .27
 LEVEL = 0.95  # cosine of a level surface's normal to up
-CELL = 1 / 48  # of a room's longest side: a cell of its sides
-NEAR = 1.5  # cells, within which a surface belongs to a side
+# of a room's longest side: a cell of its sides, and how far from one a surface belongs to it
+CELL, NEAR = 1 / 48, 1 / 32
 OUTMOST = 0.005  # part of the points that may lie beyond a side
 N_ABOUT = 32  # points whose colour a cell takes
 
 
 def room_axes(normals: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, list[float]]:
-    """Three directions about at right angles that most of the surface lies across, unit [3, 3], and
-    the share of the surface that does, of each.
+    """The three dominant normals of a surface, about at right angles, unit [3, 3], and the share of
+    the surface that faces along each.
 
     Args: normals [N, 3] unit, of any sign; weights [N], of the surface that each stands for.
     Choices: directions are tried at the normals of N_TRIED surfaces.
@@ -84,33 +84,36 @@ def sides_of(
     colours u8 [M, 3].
 
     Args: means [N, 3]; normals [N, 3] unit, of any sign; colors u8 [N, 3]: of its surfaces; axes:
-      by `room_axes`, made orthogonal; eyes [V, 3] of its cameras.
-    Choices: a side lies where the outmost points end that face along an axis (OUTMOST of them lie
-      beyond), has N_ABOUT of them, and all cameras on one side of it. Sides reach to one another,
-      or as far as points and cameras do. A cell has the median colour of the N_ABOUT nearest points
-      of its side: what stands or hangs in one place colours little.
+      by `room_axes`, the strongest first; eyes [V, 3] of its cameras.
+    Choices: the second axis is made perpendicular to the first, the third to both. A side lies
+      where the outmost points end that face along an axis (OUTMOST of them lie beyond); it needs
+      N_ABOUT of them, and every camera inside. Sides reach to one another, or as far as points and
+      cameras do. A cell has the median colour of the N_ABOUT nearest points of its side: what
+      stands or hangs in one place colours little.
     """
-    left, _, right = np.linalg.svd(axes)
-    frame = left @ right
-    local, at = means @ frame.T, eyes @ frame.T
+    third = np.cross(axes[0], axes[1])
+    frame = np.stack([axes[0], np.cross(third, axes[0]), third])
+    frame /= np.linalg.norm(frame, axis=1, keepdims=True)
+    local, cameras = means @ frame.T, eyes @ frame.T
     low, high = np.quantile(local, (OUTMOST, 1 - OUTMOST), axis=0)
-    edge = CELL * float((high - low).max())
+    near = NEAR * float((high - low).max())
     sides = []
     for axis in range(3):
         facing = np.abs(normals @ frame[axis]) > PARALLEL
         for bounds, inward in ((low, 1), (high, -1)):
-            near = np.flatnonzero(facing & (np.abs(local[:, axis] - bounds[axis]) < NEAR * edge))
-            if len(near) >= N_ABOUT:
-                place = float(np.median(local[near, axis]))
-                if (inward * (at[:, axis] - place) > 0).all():
-                    sides.append((axis, place, near))
-    low, high = np.minimum(low, at.min(0)), np.maximum(high, at.max(0))
+            rows = np.flatnonzero(facing & (np.abs(local[:, axis] - bounds[axis]) < near))
+            if len(rows) >= N_ABOUT:
+                offset = float(np.median(local[rows, axis]))
+                if (inward * (cameras[:, axis] - offset) > 0).all():
+                    sides.append((axis, offset, rows))
+    low, high = np.minimum(low, cameras.min(0)), np.maximum(high, cameras.max(0))
+    edge = CELL * float((high - low).max())
     points, about = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for axis, place, near in sides:
+    for axis, offset, rows in sides:
         others = [k for k in range(3) if k != axis]
         middles = [np.arange(low[k] + edge / 2, high[k], edge) for k in others]
         grid = np.stack(np.meshgrid(*middles, indexing="ij"), -1).reshape(-1, 2)
-        points.append(np.insert(grid, axis, place, axis=1))
-        nearest = cKDTree(local[near][:, others]).query(grid, N_ABOUT)[1]
-        about.append(np.median(colors[near[nearest]], axis=1))
+        points.append(np.insert(grid, axis, offset, axis=1))
+        nearest = cKDTree(local[rows][:, others]).query(grid, N_ABOUT)[1]
+        about.append(np.median(colors[rows[nearest]], axis=1))
     return np.concatenate(points) @ frame, np.concatenate(about).round().astype(np.uint8)

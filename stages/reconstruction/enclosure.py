@@ -6,16 +6,21 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from chebsplat.cameras import centers, unproject
 from chebsplat.labels.agreement import project, unhidden
 from chebsplat.shape.room import LEAST_BOXED, room_axes, sides_of
 from chebsplat.splats.gaussians import local_shape
 
-# of `shown_once`: 17 scenes of 52 to 105 photos have .01 at most, 13 of 6 or 10 photos .15 at least
+# of `unique_share`: 17 scenes of 52 to 105 photos have .01 at most, 13 of 6 or 10 photos .15
 FEW = 0.05
 N_ASKED, PER_SIDE, HARDLY_ANY = 12, 40, 0.01
-BEFORE = 0.97  # of a surface's depth: what lies nearer, its photo sees through
+# that give a point its normal: of 16 the noise of a depth camera hides a room's directions
+N_NEIGHBORS = 64
+# of the shares of `room_axes`: seven rooms have .04 at least, six other scenes .02 at most
+LEAST_OF_EACH = 0.03
+BEFORE = 0.97  # of a pixel's depth: nearer than this is free space
 
 
 def enclosed(
@@ -23,26 +28,27 @@ def enclosed(
     views: np.ndarray,
     depth: Callable[[int], np.ndarray],
     size: tuple[int, int],
-    n_neighbors: int,
 ) -> tuple[dict[str, Any], str]:
     """means, colors and seen_from of points on the sides of a room in cells that no photo shows, as
     a cloud has them, none where photos leave out little, or it is no room; and why not.
 
     Args: views: of the cloud's, those that are trained on; depth: of one of these f32 [H, W], not
-      positive where unknown; size: (W, H); n_neighbors: of a point, by which its normal is told.
-    Choices: none where photos show nearly all (`shown_once`): what is behind things stays behind
+      positive where unknown; size: (W, H).
+    Choices: none where photos show nearly all (`unique_share`): what is behind things stays behind
       them. A photo shows a cell unless its depth there is less, or unknown. A room has LEAST_BOXED
-      of its points across three directions. A point is seen from the nearest camera.
+      of its points across three directions, and LEAST_OF_EACH across each. A point is seen from the
+      nearest camera.
     """
     none = {key: cloud[key][:0] for key in ("means", "colors", "seen_from")}
-    alone = shown_once(cloud, views, depth, size)
+    alone = unique_share(cloud, views, depth, size)
     if alone < FEW:
-        return none, f"{100 * (1 - alone):.0f} % of what a photo shows is in another one, too"
+        return none, f"a photo shows {100 * alone:.0f} % that no other does"
     means, eyes = cloud["means"], centers(cloud["cam_from_world"])[views]
-    normals = local_shape(means, n_neighbors)[1].astype(np.float64)
+    normals = local_shape(means, N_NEIGHBORS)[1].astype(np.float64)
     axes, shares = room_axes(normals, np.ones(len(means)))
-    if sum(shares) < LEAST_BOXED:
-        return none, f"{100 * sum(shares):.0f} % of the points lie on sides at right angles"
+    if sum(shares) < LEAST_BOXED or min(shares) < LEAST_OF_EACH:
+        said = ", ".join(f"{100 * share:.0f}" for share in shares)
+        return none, f"{said} % of the points face along three directions: this is no room"
     points, colors = sides_of(means, normals, cloud["colors"], axes, eyes)
     shown = np.zeros(len(points), bool)
     for k in views:
@@ -51,18 +57,18 @@ def enclosed(
         columns, rows = image[inside, :2].astype(int).T
         shown[inside] |= BEFORE * image[inside, 2] < depth(k)[rows, columns]
     points, colors = points[~shown], colors[~shown]
-    nearest = np.linalg.norm(points[:, None] - eyes, axis=2).argmin(1)
+    nearest = cKDTree(eyes).query(points)[1]
     return {"means": points, "colors": colors, "seen_from": views[nearest]}, ""
 
 
-def shown_once(
+def unique_share(
     cloud: dict[str, Any],
     views: np.ndarray,
     depth: Callable[[int], np.ndarray],
     size: tuple[int, int],
 ) -> float:
-    """Share of what a view shows that no other does, arguments as of `enclosed`: of another photo
-    about as much would be new.
+    """Share of what a view shows that no other does, arguments as of `enclosed`: about as much of
+    another photo would be new.
 
     Choices: mean over up to N_ASKED views, of a grid of PER_SIDE pixels along the longer side. When
       no more than HARDLY_ANY of a view is left, no further ones are looked at.
@@ -71,7 +77,8 @@ def shown_once(
     for k in views[:: -(-len(views) // N_ASKED)]:
         surface = depth(k)
         step = -(-max(surface.shape) // PER_SIDE)
-        pixels = np.argwhere(surface[::step, ::step] > 0) * step
+        known = np.isfinite(surface) & (surface > 0)
+        pixels = np.argwhere(known[::step, ::step]) * step
         left = unproject(surface, cloud["Ks"][k], cloud["cam_from_world"][k], pixels)
         for other in rng.permutation(views[views != k]):
             if len(left) <= HARDLY_ANY * len(pixels):
