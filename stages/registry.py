@@ -27,7 +27,7 @@ class Stage:
       redkitchen, house_kitchen and seven captures of photos at 640 to 1600 pixels, within a factor
       of 1.5 for most. A machine corrects the seconds by those of its own scenes.
     memory: MB that its process has at most on a CPU, by the same facts: fitted to office0, fox,
-      redkitchen and house_kitchen, and to 50 and 100 photos of 1600 pixels. A user's teacher and
+      redkitchen, house_kitchen, and 23 to 100 photos of 1600 pixels. A user's teacher and
       more than 40,000 Gaussians were not measured.
     minutes, mem_mb: what a job requests of a cluster, ten times the longest measured time and three
       times the memory: a job that requests too little is lost, one that requests too much starts a
@@ -87,7 +87,9 @@ STAGES: dict[str, Stage] = {
               seconds=lambda k: 0.5 + 2.4 * k.trained if k.kind == "generated"
               else 0.5 + 0.03 * k.raw + 0.4 * k.trained,
               megabytes=lambda k: 2.7 * k.trained, minutes=10, mem_mb=2000,  # 21, 49; 306 MB
-              memory=lambda k: 200 + 3.6 * k.trained + 1130 * k.trained / k.photos,
+              # a photo that is reduced takes more than one that is undistorted alone
+              memory=lambda k: 350 + 3.6 * k.trained
+              + (970 if k.raw > 1.01 * k.trained else 560) * k.trained / k.photos,
               help="Read a source into a capture: images, cameras and, where given, depth and "
                    "labels."),
         Stage("sfm", "chebsplat.points/2", ("sfm",), (("capture", "ingest"),),
