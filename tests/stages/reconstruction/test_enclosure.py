@@ -9,9 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from chebsplat.labels.agreement import project
 from chebsplat.shape.room import CELL
+from chebsplat.splats.gaussians import local_shape
 from chebsplat.stages.reconstruction.enclosure import BEFORE, enclosed
 from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.sfm import with_sides
+from chebsplat.stages.shape_models.surfaces import from_depth
 
 LOW, HIGH = np.array([-2.5, -2, 0]), np.array([2.5, 2, 2.5])
 SIZE = (160, 120)
@@ -144,3 +146,20 @@ def test_the_stage_asks_training_views_alone_and_says_why_it_adds_nothing():
     assert with_sides(off, capture, cloud, True) is cloud and "is off" in said.popitem()[1]
     capture.loss_mask = np.zeros((3, *SIZE[::-1]), bool)
     assert with_sides(job, capture, cloud, True) is cloud and "shows 0 %" in said.popitem()[1]
+
+
+def test_knowledge_reads_nothing_where_no_photo_looks():
+    cloud, depths, _ = room(np.eye(3))
+    shown = len(cloud["means"])
+    means = np.concatenate([cloud["means"], sides(cloud, depths)[0]["means"]])
+    covariances, normals = local_shape(means, 16)
+
+    def surface(n, notes):
+        parts = {"means": means[:n], "normals": normals[:n], "covariances": covariances[:n]}
+        notes |= {"largest": 0.1, "from": LOW.tolist()}
+        return from_depth(SimpleNamespace(**parts, notes=notes))
+
+    found = surface(len(means), {"n_on_sides": len(means) - shown - 9, "n_behind": 9})
+    for part, other in zip(found, surface(shown, {}), strict=True):
+        np.testing.assert_array_equal(part, other)
+    assert len(found.means) < len(surface(len(means), {}).means)
