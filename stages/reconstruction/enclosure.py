@@ -47,16 +47,16 @@ def enclosed(
     normals = local_shape(means, N_NEIGHBORS)[1].astype(np.float64)
     axes, shares = room_axes(normals, np.ones(len(means)))
     if sum(shares) < LEAST_BOXED or min(shares) < LEAST_OF_EACH:
-        said = ", ".join(f"{100 * share:.0f}" for share in shares)
-        return none, f"{said} % of the points face along three directions: this is no room"
+        percent = ", ".join(f"{100 * share:.0f}" for share in shares)
+        return none, f"{percent} % of the points face along three directions: this is no room"
     points, colors = sides_of(means, normals, cloud["colors"], axes, eyes)
-    shown = np.zeros(len(points), bool)
+    visible = np.zeros(len(points), bool)
     for k in views:
         image = project(points, cloud["Ks"][k], cloud["cam_from_world"][k], size)
         inside = np.flatnonzero(np.isfinite(image[:, 0]))
         columns, rows = image[inside, :2].astype(int).T
-        shown[inside] |= BEFORE * image[inside, 2] < depth(k)[rows, columns]
-    points, colors = points[~shown], colors[~shown]
+        visible[inside] |= BEFORE * image[inside, 2] < depth(k)[rows, columns]
+    points, colors = points[~visible], colors[~visible]
     nearest = cKDTree(eyes).query(points)[1]
     return {"means": points, "colors": colors, "seen_from": views[nearest]}, ""
 
@@ -77,8 +77,8 @@ def unique_share(
     for k in views[:: -(-len(views) // N_ASKED)]:
         surface = depth(k)
         step = -(-max(surface.shape) // PER_SIDE)
-        known = np.isfinite(surface) & (surface > 0)
-        pixels = np.argwhere(known[::step, ::step]) * step
+        measured = np.isfinite(surface) & (surface > 0)
+        pixels = np.argwhere(measured[::step, ::step]) * step
         left = unproject(surface, cloud["Ks"][k], cloud["cam_from_world"][k], pixels)
         for other in rng.permutation(views[views != k]):
             if len(left) <= HARDLY_ANY * len(pixels):
