@@ -13,9 +13,9 @@ from chebsplat.labels.agreement import project, unhidden
 from chebsplat.shape.room import LEAST_BOXED, room_axes, sides_of
 from chebsplat.splats.gaussians import local_shape
 
-# of `unique_share`: 17 scenes of 52 to 105 photos have .01 at most, 13 of 6 or 10 photos .15
+# of `unique_share`: at most .01 in 17 scenes of 52 to 105 photos, at least .15 in 13 of 6 or 10
 FEW = 0.05
-N_ASKED, PER_SIDE, HARDLY_ANY = 12, 40, 0.01
+N_ASKED, PER_SIDE, HARDLY_ANY = 12, 40, 0.01  # views; pixels a side; part of a view
 # that give a point its normal: of 16 the noise of a depth camera hides a room's directions
 N_NEIGHBORS = 64
 # of the shares of `room_axes`: seven rooms have .04 at least, six other scenes .02 at most
