@@ -173,7 +173,7 @@ def test_a_store_that_lacks_a_view_or_its_labels_is_not_finished(tmp_path):
         finished(writer, tmp_path / "two")
 
 
-def test_every_bit_of_a_view_is_guarded(tmp_path):
+def test_a_bit_that_flips_in_any_byte_of_a_view_is_noticed(tmp_path):
     stack = np.zeros((1, 65, 65, 1), np.float16)  # compresses well: few bytes to try
     path = published(tmp_path / "f", Features(["a"], stack, ["x"], np.eye(1, 1, dtype=np.float32)))
     chunk = path / "features/c.0.0.0.0"

@@ -277,7 +277,7 @@ def test_damage_to_any_file_is_named_with_its_remedy(case, damage):
         damage(file.name)(file.parent)
         with pytest.raises(InputError, match="run its stage again") as error:
             touch_all(read(path))
-        assert file.name in str(error.value) or file.parent.name in str(error.value), file
+        assert str(file) in str(error.value)
         with pytest.raises(InputError, match="run its stage again"):
             artifact.verify(path)
         file.write_bytes(good)

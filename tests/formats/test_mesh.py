@@ -42,8 +42,8 @@ def ball():
 def test_a_fused_mesh_lies_on_the_surface_in_the_cameras_world_and_bears_its_colour(ball):
     radii = np.linalg.norm(ball.vertices, axis=1)
     assert len(ball.triangles) > 1000
-    # half a voxel; distances along rays grow at the ball's rim
-    assert np.quantile(np.abs(radii - 0.5), 0.9) < 0.012
+    # a third of a voxel; distances along rays grow at the ball's rim
+    assert np.quantile(np.abs(radii - 0.5), 0.9) < 0.006
     assert np.abs(ball.vertices.mean(0)).max() < 0.005
     assert np.abs(ball.colors.astype(int) - (200, 40, 90)).max() <= 1
 
@@ -143,7 +143,7 @@ def test_both_files_hold_the_same_mesh(ball, tmp_path):
     outward = mesh.vertices / np.linalg.norm(mesh.vertices, axis=1, keepdims=True)
     normals = found[1].reshape(-1, 3)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, rtol=1e-5)
-    assert np.median((normals * outward).sum(1)) > 0.9
+    assert np.median((normals * outward).sum(1)) > 0.99
     linear = found[2].reshape(-1, 4)[:, :3] / 65535
     display = np.where(linear > 0.0031308, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
     np.testing.assert_allclose(255 * display, mesh.colors, atol=0.05)

@@ -39,11 +39,12 @@ def test_labels_in_any_language_survive_export(scene):
 
     assert Scene.read(scene).label_names == LABELS
     assert "沙发" in (scene / "labels.json").read_text(encoding="utf-8")
-    for file in scene.glob("*.ply"):
-        assert read_ply(file)[2] is not None
-        for comment in PlyData.read(str(file)).comments:
-            _, index, name = comment.split(" ", 2)
-            assert name.encode("ascii").decode("unicode_escape") == LABELS[int(index)]
+    (file,) = scene.glob("*.ply")
+    assert sorted(read_ply(file)[2]) == list(range(len(LABELS)))
+    comments = [comment.split(" ", 2) for comment in PlyData.read(str(file)).comments]
+    assert [int(index) for _, index, _ in comments] == list(range(len(LABELS)))
+    names = [name.encode("ascii").decode("unicode_escape") for _, _, name in comments]
+    assert names == LABELS
 
 
 @pytest.mark.parametrize("label", LABELS)

@@ -166,10 +166,10 @@ def rows() -> Iterator[Row]:
 HEADER = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
 AXES = b"property float y\nproperty float z\nend_header\n"
 SPLATS: list[tuple[str, bytes, str]] = [
-    ("nothing", b"", "scene.ply"),
-    ("text", b"a splat\n", "scene.ply"),
-    ("a cloud", HEADER + AXES + bytes(24), "scene.ply"),
-    ("10^12 Gaussians", HEADER.replace(b"2", b"1000000000000") + AXES, "scene.ply"),
+    ("nothing", b"", "has no PLY header"),
+    ("text", b"a splat\n", "has no PLY header"),
+    ("a cloud", HEADER + AXES + bytes(24), "has no property f_dc_0"),
+    ("10^12 Gaussians", HEADER.replace(b"2", b"1000000000000") + AXES, "declares 3,000,000,000"),
 ]
 
 

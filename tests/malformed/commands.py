@@ -26,7 +26,7 @@ SETTINGS: list[tuple[str, object, str]] = [
     ("train.method", "prnted", "'printed'"),
     ("train.seconds", float("inf"), "a finite number is needed"),
     ("train.semantics", 1, "true or false is needed"),
-    ("train.densify_until", 0.9, "densify_until"),
+    ("train.densify_until", 0.9, "densify_until must not lie after"),
     ("train.stpes", 5, "did you mean train.steps"),
     ("train.n_angles", 5, "did you mean describe.n_angles"),
     ("trian.steps", 5, "did you mean train"),
@@ -34,16 +34,16 @@ SETTINGS: list[tuple[str, object, str]] = [
 ]
 SET = {  # --set: what stderr names
     "train.steps": "section.key=value",
-    "train.steps=": "train.steps",
-    "=5": "=5",
+    "train.steps=": "'train.steps=': section.key=value is needed",
+    "=5": "'=5': section.key=value is needed",
     "../x.y=1": "set=",
-    "train.steps.more=5": "train.steps.more",
+    "train.steps.more=5": "section.key=value is needed",
     "train.stps=3": "did you mean train.steps",
     "train.steps=5, train.steps=6": "train.steps is given twice",
-    "train.lr_means=inf": "train.lr_means",
-    "train.steps=" + "9" * 5000: "train.steps",
-    "train.steps=" + DEEP: "train.steps",
-    "teacher.labels=a\nb": "teacher.labels",
+    "train.lr_means=inf": "train.lr_means: a finite number is needed",
+    "train.steps=" + "9" * 5000: "train.steps: a whole number is needed",
+    "train.steps=" + DEEP: "train.steps: a whole number is needed",
+    "teacher.labels=a\nb": "section.key=value is needed",
     "describe.n_regions=200000,describe.n_angles=64": "descriptors of",
 }
 TOMLS: list[tuple[str, bytes, str]] = [  # what a config holds, a word of the message
@@ -56,7 +56,7 @@ TOMLS: list[tuple[str, bytes, str]] = [  # what a config holds, a word of the me
 JSONS: list[tuple[str, bytes, str]] = [
     ("no UTF-8", b'{"a": "\xff"}', "UTF-8"),
     ("deep lists", DEEP.encode(), "nested too deeply"),
-    ("a list", b"[]", "a.json"),
+    ("a list", b"[]", "a table of settings is needed"),
     ("a section that is no table", b'{"train": [5]}', "train"),
 ]
 STUDY = 'title = "M"\nabout = ""\nbaseline = "a"\nscenes = ["toy"]\n'
@@ -85,51 +85,58 @@ STUDIES: list[tuple[str, str, str]] = [  # what is wrong, the text, what stderr 
     ("an unknown ablation", STUDY + '[variants.a]\nablation = "no-tel"\n', "no-tel"),
     ("an unknown scene", STUDY.replace("toy", "tyo") + "[variants.a]\n", "tyo"),
 ]
-SEQUENCES = ["[scenes", "", "scenes = []", 'scenes = "toy"', "scenes = [1, 2]", 'scenes = ["toy", '
-                                                                                '""]',
-             'scenes = ["to\\ny"]', 'scenes = ["toy"]\nsteps = 5',
-             "scenes = [" + '"toy",' * 2000 + "]"]  # fmt: skip
+SEQUENCES = {  # text: what stderr says
+    "[scenes": "does not parse",
+    **dict.fromkeys(
+        ("", "scenes = []", 'scenes = "toy"', 'scenes = ["toy"]\nsteps = 5',
+         "scenes = [" + '"toy",' * 2000 + "]"),
+        'it says scenes = ["...", ...]',
+    ),
+    "scenes = [1, 2]": "1 is no scene's name",
+    'scenes = ["toy", ""]': "'' is no scene's name",
+    'scenes = ["to\\ny"]': "is no scene's name",
+}  # fmt: skip
 NAMES: list[tuple[str, str, int]] = [  # a command's words, what it must name, its exit code
     ("run", "scene=", 2),
     ("run --scene ofice0", "office0", 2),
     ("run --scene toy --sequence toys", "sequence=", 2),
     ("run --scene toy --stage trian", "train", 2),
-    ("run --scene toy --stage ../train", "stage", 2),
-    ("run --scene toy --cores 0", "--cores", 2),
-    ("run --scene toy --device tpu", "--device", 2),
+    ("run --scene toy --stage ../train", "no stage is called ../train", 2),
+    ("run --scene toy --cores 0", "Invalid value for '--cores'", 2),
+    ("run --scene toy --device tpu", "Invalid value for '--device'", 2),
     ("run --scene toy --nonsense", "No such option", 2),
     ("run --scene toy --ablation no-densfy", "no-densify", 2),
-    ("run --scene toy --ablation ../scenes/toy", "../scenes/toy", 2),
+    ("run --scene toy --ablation ../scenes/toy", "no ablation is called ../scenes/toy", 2),
     ("run --scene ./nowhere/", "not a folder", 3),
-    ("run --scene ./file", "./file", 3),
-    ("run --scene ../scenes/toy", "../scenes/toy", 3),
-    (f"run --scene ./{LONG}", LONG[:70], 3),
-    ("run --scene ~nobody-of-this-name", "~nobody-of-this-name", 2),
+    ("run --scene ./file", "./file is not a folder", 3),
+    ("run --scene ../scenes/toy", "../scenes/toy is not a folder", 3),
+    (f"run --scene ./{LONG}", f"{LONG[:70]}' is not a folder", 3),
+    ("run --scene ~nobody-of-this-name", "no scene is called ~nobody-of-this-name", 2),
     ("run --sequence ofices", "offices", 2),
     ("run --sequence toys --ablation no-tle", "no ablation is called no-tle", 2),
     ("plan --scene toy --set knowledge.start=.rooms", "'.rooms' cannot name a set", 2),
     ("knowledge log --set ../rooms", "'../rooms' cannot name a set", 2),
     ("knowledge forget 0123456789abcdef", "rooms has no lesson 0123456789abcdef", 2),
-    ("run --sequence nowhere.toml", "nowhere.toml", 2),
-    (f"plan --sequence {LONG}.toml", LONG[:70], 2),
+    ("run --sequence nowhere.toml", "nowhere.toml is missing", 2),
+    (f"plan --sequence {LONG}.toml", f"{LONG}.toml: File name too long", 2),
     ("study methd", "did you mean method", 2),
-    ("study ../studies/toys", "../studies/toys", 2),
-    ("study nowhere.toml", "nowhere.toml", 2),
-    ("study toys --threads 0", "--threads", 2),
+    ("study ../studies/toys", "no study is called ../studies/toys", 2),
+    ("study nowhere.toml", "nowhere.toml is missing", 2),
+    ("study toys --threads 0", "Invalid value for '--threads'", 2),
     ("settings trian", "train", 2),
     ("settings train.stpes", "train.steps", 2),
     ("verify nowhere", "no finished scene", 2),
-    ("verify ./nowhere", "./nowhere", 3),
-    ("rm . --yes", ".", 3),
-    ("rm .. --yes", "..", 3),
-    ("rm ./file --yes", "./file", 3),
-    ("query nowhere sofa", "nowhere", 2),
-    ("query ./file sofa", "./file", 3),
+    ("verify ./nowhere", "./nowhere is missing", 3),
+    ("rm . --yes", " . is no finished scene", 3),
+    ("rm .. --yes", " .. is no finished scene", 3),
+    ("rm ./file --yes", "neither a scene", 3),
+    ("query nowhere sofa", "nowhere is no finished scene", 2),
+    ("query ./file sofa", "neither a scene", 3),
     ("extract office0 --out x.ply", "make scene=office0", 2),
-    ("extract ./nowhere --out x.ply", "./nowhere", 3),
-    ("lift nowhere.ply --capture ./nowhere --out x", "./nowhere", 3),
-    ("check-teacher nowhere.onnx", "nowhere.onnx", 3),
-    ("nonsense", "nonsense", 2),
+    ("extract ./nowhere --out x.ply", "./nowhere is missing", 3),
+    ("lift nowhere.ply --capture ./nowhere --out x", "./nowhere is missing", 3),
+    ("check-teacher nowhere.onnx", "nowhere.onnx is missing", 3),
+    ("nonsense", "No such command 'nonsense'", 2),
     ("sfm --out x", "Missing option '--in-capture'", 2),
 ]
 
@@ -202,8 +209,8 @@ def documents() -> Iterator[Row]:
         yield met("json config", what, put("a.json", content), word)
     for what, text, word in STUDIES:
         yield met("study", what, put("a.toml", text), word)
-    for text in SEQUENCES:
-        yield met("sequence", f"{text!r}", put("a.toml", text), "a.toml")
+    for text, word in SEQUENCES.items():
+        yield met("sequence", f"{text!r}", put("a.toml", text), word)
     yield met("config", "missing", lambda folder: None, "is missing")
     yield met("config", "a folder", no_file("a.toml", "folder"), "is a folder")
     for kind in ("config", "study", "sequence"):
@@ -219,8 +226,9 @@ def names() -> Iterator[Row]:
         yield words("command", line.split(), word, code=code)
     for word in ("a\nb", "\x1b[31mred", "toy\udcff"):
         yield words("command", ["run", "--scene", word], repr(word))
-    for command, word in ((["run", "--scene"], "scene="), (["run", "--sequence"], "sequence"),
-                          (["study"], "study"),
+    for command, word in ((["run", "--scene"], "scene="),
+                          (["run", "--sequence"], "no sequence can be called"),
+                          (["study"], "no study can be called"),
                           (["verify"], "''")):  # fmt: skip
         yield words("command", [*command, ""], word)
 
@@ -367,9 +375,13 @@ def work() -> Iterator[Row]:
         edit=photo,
     )
     yield words(
-        "work, photos", ["extract", "images", "--out", "x.ply"], "images", code=3, edit=photo
+        "work, photos",
+        ["extract", "images", "--out", "x.ply"],
+        "images is no finished scene",
+        code=3,
+        edit=photo,
     )
-    yield words("work, links elsewhere", ["rm", "./mine", "--yes"], "mine", code=3,
+    yield words("work, links elsewhere", ["rm", "./mine", "--yes"], "mine does not lie in", code=3,
                 edit=lambda folder: linked(folder, "mine", "train"))  # fmt: skip
 
 

@@ -216,7 +216,7 @@ def models() -> Iterator[tuple[str, str, Edit, str]]:
     yield MODEL, "an input of bytes", byte, "float32 input"
     yield MODEL, "an output of rank 2", model(node("Flatten")), "[1, C, h, w] is needed"
     yield MODEL, "one feature a view", model(node("GlobalAveragePool")), "one feature every"
-    yield MODEL, "weights outside", changed(outside), MODEL
+    yield MODEL, "weights outside", changed(outside), "has weights outside its folder"
     of_32 = all_of(partial(color_teacher, shape=(1, 3, 32, 32)), set_to("size", "[64, 64]"))
     yield MODEL, "another size than its graph", of_32, "says size = [64, 64]"
     yield MODEL, "multiple not met", halves(), "correct `size` or `multiple`"
@@ -276,13 +276,13 @@ def rows() -> Iterator[Row]:
         "teacher", f"{MODEL}: 65 channels", many_channels, (MODEL, "at most 64 can be rendered"), 2
     )
     yield met(MODEL, "nan", model(node("Log")), "non-finite values", 4)
-    yield met(MODEL, "an output of 120 GB", huge(), MODEL, 3, True)
+    yield met(MODEL, "an output of 120 GB", huge(), "120,000,000,000 bytes; at most", 3, True)
     for factor in (100, 200, 400, 100_000):  # 0.37, 1.5, 5.9 GB, more than any machine has
         words = "bytes of memory are needed"
         yield met(
             MODEL, f"an output of {factor} times the image's sides", grown(factor), words, 3, True
         )
     yield met(MODEL, "constants of 3.6 GB", folded(), "bytes of memory are needed", 3, True)
-    yield met(MODEL, "a loop of 2^62 steps", endless(), MODEL, 3, True)
+    yield met(MODEL, "a loop of 2^62 steps", endless(), "not done after", 3, True)
     yield met(MODEL, "a pipe", no_file(MODEL, "pipe"), "is missing", 3, True)
     yield met(TABLE, "a zip bomb", bomb, "are read", 3, True)

@@ -67,8 +67,12 @@ def test_a_ply_gets_what_its_checkpoint_gets_and_becomes_a_folder_of_artifacts(l
         tmp_path / "a.ply", artifacts() / "ingest", None, artifacts() / "teacher", None, out
     )
     assert figures["gaussians"] == N
-    np.testing.assert_array_equal(Lifted.read(out / "lift").features, Lifted.read(lifted).features)
-    assert Scene.read(out / "export").labels is not None
+    features = Lifted.read(lifted).features
+    np.testing.assert_array_equal(Lifted.read(out / "lift").features, features)
+    scene = Scene.read(out / "export")
+    np.testing.assert_array_equal(scene.labels[np.argsort(scene.order)] == -1, ~features.any(1))
+    folders = {path.name for path in out.iterdir() if path.is_dir()}
+    assert folders == {"gaussians", "lift", "export", "ingest", "teacher"}
 
 
 def test_a_splat_in_another_frame_and_a_capture_without_poses_are_refused(tmp_path):

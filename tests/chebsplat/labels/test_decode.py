@@ -49,6 +49,15 @@ def test_noise_free_features_decode_to_their_labels():
     assert (confidence > 0.9).all()
 
 
+def test_blurred_features_at_an_edge_hold_the_codes_of_both_sides():
+    labels = np.repeat([[0] * 9 + [1] * 9], 9, 0)
+    features = noisy_features(labels, np.eye(2, 4), 1.0, 0.0, np.random.default_rng(0))
+    other = (
+        0.5 - 0.5 / np.exp(-0.5 * np.arange(-4, 5) ** 2).sum()
+    )  # of a Gaussian beyond its middle
+    assert np.allclose(features[:, 8, 1] / features[:, 8, 0], other / (1 - other), rtol=1e-3)
+
+
 def test_labels_are_told_in_parts_as_they_are_in_one():
     rng = np.random.default_rng(5)
     features, embeddings = rng.normal(size=(60, 80, 3)), rng.normal(size=(2000, 3))

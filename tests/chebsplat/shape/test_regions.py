@@ -30,9 +30,11 @@ def test_centres_are_in_farthest_point_order(points):
     assert reach == pytest.approx(distance.max(), rel=1e-6)
 
 
-def test_seed_decides_the_start():
-    assert list(farthest_points(cloud(), 5, 3)[0]) == list(farthest_points(cloud(), 5, 3)[0])
-    assert list(farthest_points(cloud(), 5, 3)[0]) != list(farthest_points(cloud(), 5, 4)[0])
+def test_the_seed_decides_the_first_centre_and_the_thinning():
+    every = DescribeSection(n_regions=4000, region_size=16)  # each point, which has 15 neighbours
+    one, other = (regions_of(cloud(), every.model_copy(update={"seed": k})) for k in (0, 1))
+    assert one.centers[0] != other.centers[0]
+    assert len(np.setxor1d(one.members[:, 1:], other.members[:, 1:])) > 50
 
 
 @pytest.mark.parametrize("unit", [1e-30, 1.0, 1e30])

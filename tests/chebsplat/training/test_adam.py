@@ -44,14 +44,6 @@ def test_the_same_bits_on_any_number_of_threads():
     assert_same_bits(compute)
 
 
-def test_a_state_moves_from_torch_to_the_kernel():
-    _, _, theirs = course(lambda groups: torch.optim.Adam(groups, eps=1e-15, fused=True))
-    _, _, ours = course(adam)
-    ours.load_state_dict(theirs.state_dict())
-    counts = {int(state["step"]) for state in ours.state.values()}
-    assert counts == {50, 44}
-
-
 def test_a_closure_is_refused():
     _, _, optimizer = course(adam)
     with pytest.raises(ValueError, match="closure"):

@@ -34,6 +34,12 @@ def grow(parameters, members, gradient, budget=50, threshold=1e-4, seed=0, **opt
     )
 
 
+def spacing_of(parameters):
+    """Median over the Gaussians of the mean distance to the nearest three."""
+    means = parameters["means"].double()
+    return torch.cdist(means, means).topk(4, largest=False).values[:, 1:].mean(1).median()
+
+
 # masks
 
 
@@ -109,26 +115,23 @@ def test_additions_keep_their_promises(n, n_regions, budget, log_size, flat, bou
     assert inside.all()
     for name in ("quats", "sh0", "prune_logits"):
         assert torch.equal(found.rows[name], parameters[name][found.parents])
-    for name, values in found.changed.items():
-        assert torch.equal(values, found.rows[name])
-        assert (values <= parameters[name][found.parents] + 1e-5).all()
+    parents = {name: value[found.parents] for name, value in parameters.items()}
+    offsets = found.rows["means"] - parents["means"]
+    logits, log_scales, quats = (parents[k] for k in ("logit_opacities", "log_scales", "quats"))
+    shared = densify.shared_opacity(logits, log_scales, quats, offsets)
+    torch.testing.assert_close(found.rows["logit_opacities"], shared, rtol=0, atol=1e-3)
+    shared = densify.shared_scales(log_scales, quats, offsets)
+    torch.testing.assert_close(found.rows["log_scales"], shared, rtol=0, atol=1e-3)
+    assert all(torch.equal(values, found.rows[name]) for name, values in found.changed.items())
 
 
 def test_new_gaussians_keep_apart_from_each_other():
-    parameters = raw(400)
-    members = torch.arange(400).reshape(10, 40)
-    found = grow(parameters, members, torch.ones(10), 400, density=1.0)
+    parameters = raw(401)
+    options = {"density": 1.0, "max_candidates": 2000}
+    found = grow(parameters, torch.arange(401)[None], torch.ones(1), 400, **options)
     new = found.rows["means"].double()
     assert len(new) > 30
-    gaps = torch.cdist(new, new) + torch.eye(len(new))
-    three = (
-        torch.cdist(parameters["means"], parameters["means"])
-        .topk(4, largest=False)
-        .values[:, 1:]
-        .mean(1)
-    )
-    spacing = three[members].median(1).values
-    assert gaps.min() >= 0.5 * 0.9 * spacing.min()
+    assert (torch.cdist(new, new) + torch.eye(len(new))).min() >= 0.5 * spacing_of(parameters)
 
 
 def test_steeper_regions_come_first_where_the_budget_is_short():
@@ -143,12 +146,24 @@ def test_steeper_regions_come_first_where_the_budget_is_short():
         assert torch.isin(parents, halves[steeper]).all()
 
 
-def test_more_excess_gradient_brings_more_candidates_whatever_the_unit():
-    parameters, members, counts = raw(1000), torch.arange(1000)[None], []
-    for unit, excess in ((1, 1.05), (1, 2.0), (100, 2.0)):
+def test_candidates_are_as_many_as_eq_12_has_whatever_the_unit_and_fill_the_ball(monkeypatch):
+    drawn, draw = [], densify._in_unit_ball
+    monkeypatch.setattr(densify, "_in_unit_ball", lambda *of: drawn.append(draw(*of)) or drawn[-1])
+    parameters, members = raw(1001), torch.arange(1001)[None]
+    away = parameters["means"].double() - parameters["means"].double().mean(0)
+    whole = 4 / 3 * math.pi * (away.norm(dim=1).max() / spacing_of(parameters)) ** 3
+    for unit, gradient, most, wanted in (
+        (1, 1.25e-4, 10**6, whole / 4), (1, 1.25e-4, 7, 7), (1, 2e-4, 10**6, whole),
+        (100, 5e-4, 10**6, whole),
+    ):  # fmt: skip
         scaled = parameters | {"means": unit * parameters["means"]}
-        counts.append(len(grow(scaled, members, torch.tensor([1e-4 * excess])).parents))
-    assert counts[0] < counts[1] == counts[2]
+        options = {"budget": 1000, "density": 1.0, "max_candidates": most}
+        grow(scaled, members, torch.tensor([gradient]), **options)
+        assert len(drawn[-1]) == pytest.approx(wanted, abs=1)
+    shares = torch.from_numpy(drawn[-1]).norm(dim=1) ** 3  # even over [0, 1]
+    counts = torch.histc(shares, 10, 0, 1)
+    assert counts.sum() == len(shares) > 5000
+    assert counts.sub(len(shares) / 10).abs().max() < 0.02 * len(shares)
 
 
 def test_densify_is_fixed_by_its_generator_and_leaves_its_input_alone():
@@ -345,18 +360,9 @@ def test_rows_can_come_and_go_before_the_first_step_and_down_to_none():
     assert all(len(v) == 0 and v.requires_grad for v in parameters.values())
 
 
-def test_selecting_what_was_appended_gives_it_back():
-    parameters, more = raw(5), raw(3, seed=1)
-    both = optimizer_rows.append(parameters, more)
-    first, last = (
-        optimizer_rows.select(both, torch.arange(8) < 5),
-        optimizer_rows.select(both, torch.arange(5, 8)),
-    )
-    assert all(
-        torch.equal(first[k], parameters[k]) and torch.equal(last[k], more[k]) for k in parameters
-    )
+def test_rows_that_lack_a_parameter_are_refused():
     with pytest.raises(ValueError, match="do not fit"):
-        optimizer_rows.append(parameters, {"means": more["means"]})
+        optimizer_rows.append(raw(5), {"means": raw(3)["means"]})
 
 
 def test_added_rows_and_changed_parents_start_with_zero_moments():

@@ -5,6 +5,7 @@ exist.
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
 from chebsplat.training.losses import (
     feature_distance,
@@ -63,16 +64,25 @@ def test_masked_pixels_have_no_influence_and_no_gradient():
     assert photometric(render, target, torch.zeros_like(mask), 0.2).item() == 0
 
 
-def test_ssim_of_pictures_is_that_of_the_loss():
-    a, b = np.random.default_rng(0).integers(0, 255, (2, 30, 40, 3), dtype=np.uint8)
-    doubles = (torch.from_numpy(image).double() / 255 for image in (a, b))
-    assert ssim(a, b) == pytest.approx(float(ssim_map(*doubles).mean()), abs=1e-13)  # rounding
+def test_ssim_of_pictures_and_of_the_loss_is_its_published_formula():
+    """Wang et al. 2004 by SciPy's Gaussian: window 11, σ 1.5, K1 = .01, K2 = .03, zeros outside."""
+    rng = np.random.default_rng(0)
+    a = rng.integers(0, 255, (30, 40, 3), dtype=np.uint8)
+    b = (0.6 * a + 0.4 * rng.integers(0, 255, a.shape)).astype(np.uint8)
+    x, y = a / 255, b / 255
 
+    def blur(values):
+        return gaussian_filter(values, (1.5, 1.5, 0), mode="constant", radius=(5, 5, 0))
 
-def test_ssim_of_equal_images_is_one():
-    image = np.random.default_rng(0).integers(0, 255, (30, 40, 3), dtype=np.uint8)
-    assert abs(ssim(image, image) - 1) < 1e-12
-    assert ssim(image, 255 - image) < 0.5
+    means, variances = (blur(x), blur(y)), [blur(v * v) - blur(v) ** 2 for v in (x, y)]
+    light = (2 * means[0] * means[1] + 1e-4) / (means[0] ** 2 + means[1] ** 2 + 1e-4)
+    covariance = blur(x * y) - means[0] * means[1]
+    expected = (light * (2 * covariance + 9e-4) / (sum(variances) + 9e-4)).mean()
+    assert 0.2 < expected < 0.9
+    assert ssim(a, b) == pytest.approx(expected, abs=1e-7)  # float32 taps
+    loss = ssim_map(*(torch.from_numpy(image) for image in (x, y))).mean()
+    assert ssim(a, b) == pytest.approx(float(loss), abs=1e-13)  # rounding
+    assert abs(ssim(a, a) - 1) < 1e-12
 
 
 def test_feature_distance_is_zero_for_the_pooled_render_and_ignores_masked_pixels():

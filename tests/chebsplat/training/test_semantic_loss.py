@@ -53,13 +53,6 @@ def test_label_entropy_is_its_formula():
     assert abs(label_entropy(render, labels, None, 0.3).item() - total / 23) < 1e-12
 
 
-def test_its_gradient_agrees_with_finite_differences():
-    render, labels = view()
-    assert torch.autograd.gradcheck(
-        lambda r: label_entropy(r, labels, None, 0.5), render, rtol=1e-5, atol=1e-8
-    )
-
-
 @pytest.mark.parametrize("kind", ["cross-entropy", "length", "l1", None])
 def test_a_cell_without_a_label_pulls_nothing_whatever_the_loss(kind):
     render, labels = view(torch.float32)

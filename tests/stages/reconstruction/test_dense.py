@@ -147,13 +147,13 @@ def test_swept_points_lie_on_the_surfaces_and_come_from_training_views(wall, job
     z = found["means"][:, 2]
     off = np.minimum(np.abs(z / 2.5 - 1), np.abs(z / 4 - 1))
     assert len(z) > 8_000
-    assert np.quantile(off, 0.9) < 0.02
+    assert np.quantile(off, 0.9) < 0.003
     depth = found["depths"]  # of a view that is none of training, all unknown
     assert depth.shape == wall[3].shape
     assert not depth[2].any()
     known = depth > 0
     assert known[[0, 1, 3, 4]].mean() > 0.5
-    assert np.quantile(np.abs(depth[known] / wall[3][known] - 1), 0.9) < 0.02
+    assert np.quantile(np.abs(depth[known] / wall[3][known] - 1), 0.9) < 0.005
     assert set(found["seen_from"].tolist()) <= {0, 1, 3, 4}
     assert found["colors"].shape == found["means"].shape
 
@@ -162,9 +162,10 @@ def test_masked_pixels_give_no_points(wall, job):
     mask = np.ones(wall[0].shape[:3], bool)
     mask[:, :, :80] = False
     found = dense.swept(job, capture_of(wall, loss_mask=mask), cloud_of(wall))
-    place = found["means"] + [0.4, 0, 0]  # of the first view's camera
-    first = found["seen_from"] == 0
-    assert (place[first, 0] / place[first, 2] * FOCAL + 80 > 80).all()
+    assert not found["depths"][..., :80].any()
+    assert (found["depths"][[0, 1, 3, 4], :, 80:] > 0).mean() > 0.5
+    place = found["means"] + wall[2][found["seen_from"], :3, 3]
+    assert len(place) > 2000 and (place[:, 0] > 0).all()  # right of each camera's middle
 
 
 def test_points_are_added_where_most_cells_are_empty_and_never_beside_depth(wall):

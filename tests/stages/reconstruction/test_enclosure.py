@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from chebsplat.labels.agreement import project
 from chebsplat.shape.room import CELL
 from chebsplat.splats.gaussians import local_shape
-from chebsplat.stages.reconstruction.enclosure import BEFORE, enclosed
+from chebsplat.stages.reconstruction.enclosure import enclosed
 from chebsplat.stages.runtime.config import Config
 from chebsplat.stages.sfm import with_sides
 from chebsplat.stages.shape_models.surfaces import from_depth
@@ -72,13 +72,8 @@ def test_what_no_photo_shows_of_a_room_continues_its_sides_in_their_colours(turn
     assert reason == "" and len(points) > 500
     distance = np.minimum(np.abs(points - LOW), np.abs(points - HIGH)).min(1)
     assert np.quantile(distance, 0.95) < EDGE / 2
-    for depth, pose in zip(depths, cloud["cam_from_world"], strict=True):
-        image = project(found["means"], K, pose, SIZE)
-        inside = np.isfinite(image[:, 0])
-        columns, rows, z = image[inside].T
-        # it looks past none of them, but for what rounding to a pixel does
-        before = depth[rows.astype(int), columns.astype(int)] / z
-        assert inside.sum() == 0 or before.max() < 1 / BEFORE
+    for pose in cloud["cam_from_world"]:  # whose photos have depth everywhere
+        assert np.isnan(project(found["means"], K, pose, SIZE)).all()
     rng = np.random.default_rng(1)
     anywhere = LOW + rng.random((600, 3)) * ([1.8, 2, 2.5] - LOW)  # as far as the cameras
     axis, high = rng.integers(0, 3, 600), rng.integers(0, 2, 600)

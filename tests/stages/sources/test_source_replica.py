@@ -1,28 +1,12 @@
-"""Both renderings of Replica become the same capture; rows of a trajectory belong to the frames
+"""Semantic-NeRF's rendering of Replica becomes a capture; rows of a trajectory belong to the frames
 they count.
 """
 
-import numpy as np
 import pytest
-from layouts import write_nice_slam, write_semantic_nerf
+from layouts import write_semantic_nerf
 from source_folders import SETTINGS, tiny
 
 from chebsplat.stages.sources import common, replica
-
-
-def test_nice_slam_layout_reads(tmp_path):
-    folder = tmp_path / "office0"
-    write_nice_slam(folder, tiny())
-    (folder / "cam_params.json").rename(tmp_path / "cam_params.json")  # of all rooms
-    assert common.detect(folder) == "replica"
-    assert replica.probe(folder) == {"poses": True, "depth": True, "labels": False}
-    assert len(replica.files(folder)) == 6 + 2
-    fields = replica.read(folder, SETTINGS)
-    assert fields["names"] == ["frame000000", "frame000001", "frame000002"]
-    assert np.allclose(fields["depth"][2], 1.002, atol=1e-4)
-    assert fields["Ks"][0][0, 2] == 4.0
-    assert fields["cam_from_world"][2][0, 3] == -2
-    assert "labels" not in fields
 
 
 def test_semantic_nerf_layout_reads_and_joins_on_number(tmp_path):

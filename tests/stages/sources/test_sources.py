@@ -154,7 +154,7 @@ def test_a_folder_without_photos_is_no_source(tmp_path):
         common.detect(tmp_path)
 
 
-def test_probes_of_a_thousand_frames_open_no_picture(tmp_path, monkeypatch):
+def test_probes_tell_what_frames_have_and_open_no_picture(tmp_path, monkeypatch):
     folders = {
         n: tmp_path / n
         for n in ("slam", "nerf", "colmap", "transforms", "photos", "scannet", "seven")
@@ -172,18 +172,18 @@ def test_probes_of_a_thousand_frames_open_no_picture(tmp_path, monkeypatch):
                  "seven/frame-{:06d}.depth.png",
                  "seven/frame-{:06d}.pose.txt"):  # fmt: skip
         (tmp_path / part).parent.mkdir(parents=True, exist_ok=True)
-        for k in range(1000):
+        for k in range(3):
             (tmp_path / part.format(k)).write_bytes(pixels)
     frames = [
-        {"file_path": f"images/{k}.png", "transform_matrix": np.eye(4).tolist()}
-        for k in range(1000)
+        {"file_path": f"images/{k}.png", "transform_matrix": np.eye(4).tolist()} for k in range(3)
     ]
     (folders["transforms"] / "transforms.json").write_text(
         json.dumps({"fl_x": 1.0, "frames": frames})
     )
-    modules = {"slam": replica, "nerf": replica, "colmap": colmap, "transforms": transforms,
-               "photos": photos,
-               "scannet": scannet, "seven": seven_scenes}  # fmt: skip
+    depth, every = {"poses", "depth"}, {"poses", "depth", "labels"}
+    wanted = {"slam": (replica, depth), "nerf": (replica, every), "colmap": (colmap, every),
+              "transforms": (transforms, {"poses"}), "photos": (photos, set()),
+              "scannet": (scannet, every), "seven": (seven_scenes, depth)}  # fmt: skip
     monkeypatch.setattr("PIL.Image.open", lambda *_, **__: pytest.fail("a probe opened a picture"))
-    for kind, module in modules.items():
-        assert module.probe(folders[kind])
+    for kind, (module, present) in wanted.items():
+        assert {name for name, has in module.probe(folders[kind]).items() if has} == present, kind

@@ -332,15 +332,15 @@ def test_views_that_a_stopped_run_finished_are_not_encoded_again(tmp_path, captu
 
 
 def test_another_teacher_starts_anew(tmp_path, capture, monkeypatch):
-    """What a stopped run left by other weights, scales or labels is never taken for this one's."""
+    """What a stopped run left by other flips, scales, weights or labels is never taken for this
+    one's; each differs from the one before in one of these.
+    """
     before: set[int] = set()
-    for folder, settings in (
-        (tmp_path / "a", {}),
-        (tmp_path / "b", {"flips": True}),
-        (tmp_path / "c", {}),
-    ):
-        folder.mkdir()
-        model = color_teacher(folder, weights=np.eye(3) * (-1 if folder.name == "c" else 1))
+    (tmp_path / "labels.txt").write_text("red\nblue\n")
+    flips, scales = {"flips": True}, {"flips": True, "scales": [2.0]}
+    labels = scales | {"labels": str(tmp_path / "labels.txt")}
+    for sign, settings in ((1, {}), (1, flips), (1, scales), (-1, scales), (-1, labels)):
+        model = color_teacher(tmp_path, weights=sign * np.eye(3))
         with monkeypatch.context() as stopped:
             stopped.setattr(
                 "chebsplat.formats.features.FeatureWriter.finish", lambda *a, **k: 1 / 0
