@@ -42,6 +42,7 @@ WORKERS = 4
 MOST_EMPTY = 1 / 3  # of the views that see a point
 MOST_CUT = 0.03  # of a side of views of photos alone, to make them as large as others
 COMPARED = 8  # views whose variance is compared with their photos'
+DOUBLED_ABOVE = 2 / 3  # pixels of a view per pixel of its photo, for splines to keep its detail
 
 
 def assemble(
@@ -469,10 +470,10 @@ def moved(at: np.ndarray, camera: Camera, other: Camera) -> tuple[np.ndarray, tu
 def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.ndarray:
     """The view u8 [H, W, 3] of an RGB photo, by area averages, undistorted where a lens bends it.
 
-    Choices: a distorted photo is interpolated by cubic splines, in an image of at least twice the
-      view's resolution: reduced to no less, or doubled by its cosine series, which is exact. A
-      pixel is the mean of four places in it, one for each quarter of its area; where it is as large
-      as the photo's, the value at its centre.
+    Choices: a distorted photo is interpolated by cubic splines, in an image of 1.5 to 3 times the
+      view's resolution: reduced to twice, as it is, or doubled by its cosine series, which is
+      exact and slow. A pixel is the mean of four places in it, one for each quarter of its area;
+      where it is as large as the photo's, the value at its centre.
     """
     if camera.model not in DISTORTED:
         same = view.whole == image.size
@@ -484,7 +485,8 @@ def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.
     small = np.asarray(
         image if size == image.size else image.resize(size, Image.Resampling.BOX), np.float32
     )
-    shape = [2 * side if scale == 1 else side for side in small.shape[:2]]
+    doubled = view.factor > DOUBLED_ABOVE
+    shape = [2 * side if doubled else side for side in small.shape[:2]]
     spans = np.array([camera.height, camera.width])[:, None, None]
     places = (at[::-1] * (np.array(shape)[:, None, None] / spans) - 0.5)[:, None]
     if view.factor < 1:
@@ -495,7 +497,7 @@ def resampled(image: Any, camera: Camera, view: Geometry, at: np.ndarray) -> np.
         )
     means = []
     for finer in np.moveaxis(small, -1, 0):  # one by one: a photo at twice its resolution is large
-        if scale == 1:
+        if doubled:
             finer = 2 * idctn(dctn(finer, norm="ortho"), s=shape, norm="ortho")
         means.append(map_coordinates(finer, places, np.float32, mode="nearest").mean(0))
     return np.stack(means, -1).round().clip(0, 255).astype(np.uint8)

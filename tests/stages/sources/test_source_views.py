@@ -361,7 +361,7 @@ def test_where_a_lens_bends_nothing_pixels_stay_and_the_scale_too(tmp_path, k):
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("side", [160, 480, 640, 8192])
+@pytest.mark.parametrize("side", [160, 480, 640, 1200, 8192])
 @pytest.mark.parametrize(
     "photo",
     [
