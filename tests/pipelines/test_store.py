@@ -12,7 +12,7 @@ from chebsplat.errors import ConfigError, InputError
 from chebsplat.formats import artifact
 from chebsplat.formats.manifest import Manifest
 from chebsplat.pipelines.planning.plan import Planner
-from chebsplat.pipelines.work import store
+from chebsplat.pipelines.work import heads, store
 
 
 @pytest.fixture(autouse=True)
@@ -88,8 +88,9 @@ def test_links_that_lead_in_a_circle_or_out_of_the_store_are_removed_alone(work,
 )
 def test_links_and_heads_never_lead_out_of_the_work_folder(work, name):
     before = sorted(work.parent.rglob("*"))
-    with pytest.raises(ConfigError):
-        store.link(name, {})
+    for named in (lambda: store.link(name, {}), lambda: heads.folder(name)):
+        with pytest.raises(ConfigError, match="cannot name a"):
+            named()
     assert sorted(work.parent.rglob("*")) == before
 
 

@@ -3,6 +3,7 @@ home folder.
 """
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -73,15 +74,19 @@ def test_what_the_user_says_of_telemetry_stands(said):
 
 
 def test_git_is_not_asked_about_a_repository_that_chebsplat_is_merely_installed_in(tmp_path):
-    from chebsplat.pipelines.running.run import HERE, git_state
+    from chebsplat.pipelines.running.run import git_state
 
     layer = tmp_path / "project/.venv/site-packages/chebsplat/pipelines"
     layer.mkdir(parents=True)
-    subprocess.run(["git", "init", "-q", tmp_path / "project"], check=True)
+    git = ["git", "-C", tmp_path / "project", "-c", "user.name=a", "-c", "user.email=a@b"]
+    for words in (["init", "-q"], ["commit", "-q", "--allow-empty", "-m", "theirs"]):
+        subprocess.run([*git, *words], check=True)
     hook = tmp_path / "hook"
     hook.write_text(f"#!/bin/sh\ntouch {tmp_path / 'ran'}\n")
     hook.chmod(0o755)
-    subprocess.run(["git", "config", "core.fsmonitor", hook], cwd=tmp_path / "project", check=True)
+    subprocess.run([*git, "config", "core.fsmonitor", hook], check=True)
     assert git_state(layer) == {}
     assert not (tmp_path / "ran").exists()
-    assert set(git_state(HERE)) <= {"commit", "dirty"}
+    shutil.copytree(layer, tmp_path / "project/pipelines")
+    assert git_state(tmp_path / "project/pipelines").keys() == {"commit", "dirty"}
+    assert (tmp_path / "ran").exists()  # as git does in a checkout that is ours

@@ -59,6 +59,7 @@ def made(scene, tmp_path_factory):
     said = np.array([*classes, None], object)[found.pictures["predicted"][:]]
     worth = found.figures["segmentation"]["scene"]["miou"]
     assert miou(said, truth_of(scene, (), range(16)), ()) == pytest.approx(100 * worth)
+    assert worth > 0.5
     return inputs["export"], said
 
 

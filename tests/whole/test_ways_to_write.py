@@ -389,11 +389,8 @@ def worth(scene, tmp_path_factory):
     for family, (write, _) in (("points", POINTS["text"]), ("depth", DEPTH["millimetres"])):
         write(folder / family / "scene", scene)
         found[family] = psnr_of(scene, folder / family, folder / family / "scene")
+        assert found[family] > 15, family
     return found
-
-
-def test_there_are_forty_ways_and_more():
-    assert len(WAYS) >= 40
 
 
 @pytest.mark.slow

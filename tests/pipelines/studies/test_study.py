@@ -473,16 +473,33 @@ def test_without_a_single_result_the_page_says_so(tmp_path):
     assert page.read_text().count("not run yet") == 2
 
 
-def test_a_figure_may_be_drawn_against_a_setting(tmp_path):
-    conditions = {f"p{p}": {"teacher": {"kind": "labels", "confusion": p}} for p in (0.0, 0.5)}
+@pytest.fixture
+def panels(monkeypatch):
+    """The axes of every figure that is saved."""
+    axes, save = [], Figure.savefig
+
+    def saved(figure, *args, **options):
+        axes.extend(figure.axes)
+        save(figure, *args, **options)
+
+    monkeypatch.setattr(Figure, "savefig", saved)
+    return axes
+
+
+def test_a_figure_against_a_setting_has_a_point_where_each_condition_sets_it(tmp_path, panels):
+    conditions = {f"p{p}": {"teacher": {"kind": "labels", "confusion": p}} for p in (0.5, 0.0)}
     noise = study(seeds=[0], conditions=conditions, against="teacher.confusion")
-    write(tmp_path, noise, *finished(noise), "c")
-    assert (tmp_path / "error-against-time.png").stat().st_size > 10_000
+    runs = expand(noise)
+    for run in runs:
+        finish(run, miou={"p0.5": 0.4, "p0.0": 0.6}[run.condition], psnr=31.5)
+    write(tmp_path, noise, runs, [row_of(run, {}) for run in runs], "c")
+    points = [[line.get_xydata().tolist() for line in panel.lines[:2]] for panel in panels]
+    for values, drawn in zip(([60, 40], [35, 15], [31.5, 31.5]), points, strict=True):
+        assert drawn == [pytest.approx(np.stack([[0, 0.5], values], 1))] * 2, values
+    assert {panel.get_xlabel() for panel in panels} == {"teacher.confusion"}
 
 
-def test_a_figure_of_colour_alone_has_a_panel_for_each_scene(tmp_path, monkeypatch):
-    panels = []
-    monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **kw: panels.extend(figure.axes))
+def test_a_figure_of_colour_alone_has_a_panel_for_each_scene(tmp_path, panels):
     runs, rows = finished(study(scenes=["toy", "office0"], seeds=[0]))
     figures.draw(tmp_path / "figure.png", rows, traces(runs, rows), None, "")
     assert [panel.get_title()[:9] for panel in panels] == ["test PSNR", "test mIoU", "PSNR on w"]
