@@ -95,9 +95,10 @@ def unknown_scene(scene: str) -> ConfigError | InputError:
     if is_source(os.path.expanduser(scene)):
         return InputError(f"{escape_text(scene)} is {where}, nor the folder of one; {run}")
     if "/" in scene:
+        word = "is" if os.path.lexists(os.path.expanduser(scene)) else "is missing:"
         return InputError(
-            f"{escape_text(scene)} is missing: neither a scene, its folder nor an "
-            "artifact; correct the path"
+            f"{escape_text(scene)} {word} neither a scene, its folder nor an artifact; "
+            "correct the path"
         )
     existing = titles()
     near = suggest(scene, existing) or existing[:8]
