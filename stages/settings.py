@@ -298,6 +298,12 @@ class TeachSection(Section):
 
     model: Text | None = setting(None, ".onnx of the teacher; default: the embedded one")
     n_rooms: int = number(80, "generated rooms to teach on", 1, 900)
+    n_modelled: int = number(
+        0,
+        "rooms of modelled furniture to teach on beside them: Debian's sweethome3d-furniture",
+        0,
+        1000,
+    )
     n_held_out: int = number(
         8, "rooms that the card's figures are of; eight kinds of room take turns", 1, 100
     )

@@ -42,10 +42,16 @@ from chebsplat.shape.point_encoder import Example, PointEncoder, cloud_of
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.settings import TeachSection
 from chebsplat.stages.shape_models.answers import SEEN, units
-from chebsplat.stages.shape_models.teaching_rooms import Room, load_room, prepare, room_path
+from chebsplat.stages.shape_models.teaching_rooms import (
+    Room,
+    catalogue,
+    load_room,
+    prepare,
+    room_path,
+)
 from chebsplat.stages.teacher_models.text_encoder import match_names, text_embeddings
 from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.synthetic.layout import KNOWLEDGE
+from chebsplat.synthetic.layout import KNOWLEDGE, MODELLED
 
 log = logging.getLogger("chebsplat")
 KINDS = ("held_out", "held_out_worn", "held_out_few", "held_out_swept")
@@ -69,7 +75,7 @@ def run(job: Job) -> None:
             f"{job.inputs['channels']} is of another teacher than {teacher.path}; pass its own"
         )
     rooms = prepare_rooms(job, settings, channels.matrix)
-    lessons, tested = rooms[: settings.n_rooms], rooms[settings.n_rooms :]
+    lessons, tested = rooms[: -settings.n_held_out], rooms[-settings.n_held_out :]
     words, embeddings = vocabulary(teacher, list(CLASS_NAMES), channels.matrix)
     named = match_names(list(CLASS_NAMES), words)
     if -1 in named:
@@ -186,7 +192,13 @@ def vocabulary(
 
 def prepare_rooms(job: Job, settings: TeachSection, matrix: np.ndarray) -> list[list[Room]]:
     """Rooms to train on, then rooms held out: clean, worn, half seen, swept; a process a thread."""
-    seeds = [*KNOWLEDGE[: settings.n_rooms], *KNOWLEDGE[-settings.n_held_out :]]
+    seeds = [
+        *KNOWLEDGE[: settings.n_rooms],
+        *MODELLED[: settings.n_modelled],
+        *KNOWLEDGE[-settings.n_held_out :],
+    ]
+    if settings.n_modelled:
+        catalogue()  # what is missing stops it now, not after the other rooms
     folder = job.scratch / "rooms"
     folder.mkdir(parents=True, exist_ok=True)
     missing = [seed for seed in seeds if not room_path(folder, seed).is_file()]

@@ -43,7 +43,7 @@ from chebsplat.stages.shape_models.teaching_rooms import Room, load_room, prepar
 from chebsplat.stages.teach import drawn_lesson, example_of
 from chebsplat.stages.teacher_models.text_encoder import match_names
 from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.synthetic.layout import KNOWLEDGE
+from chebsplat.synthetic.layout import KNOWLEDGE, MODELLED
 
 BASELINE = "pooling"
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -51,6 +51,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "transformers": {},
     "transformers, no descriptor": {"described": False},
     "pooling, no descriptor": {"attends": False, "described": False},
+    "transformers, modelled rooms too": {"modelled": True},
 }
 K = 2.0  # views that knowledge counts for
 KINDS = {"depth": 0, "few photos": 2, "swept": 3}  # of `rooms_of` that are measured
@@ -85,6 +86,12 @@ def prepare_rooms(
 def main(arguments: Sequence[str]) -> None:
     parser = shared.parser("teaching", __doc__)
     parser.add_argument("--rooms", type=int, default=64)
+    parser.add_argument(
+        "--modelled",
+        type=int,
+        default=0,
+        help="rooms of modelled furniture, on which one variant is taught, too",
+    )
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--held-out", type=int, default=8)
@@ -101,9 +108,15 @@ def main(arguments: Sequence[str]) -> None:
     embeddings = knowledge.embeddings[match_names(list(CLASS_NAMES), knowledge.words)].astype(
         np.float32
     )
-    seeds = [*KNOWLEDGE[: options.rooms], *KNOWLEDGE[-options.held_out :]]
-    rooms = prepare_rooms(options.rooms_in, seeds, settings, knowledge.matrix)
-    tested = {name: [room[kind] for room in rooms[options.rooms :]] for name, kind in KINDS.items()}
+    rooms, modelled, held_out = (
+        prepare_rooms(options.rooms_in, seeds, settings, knowledge.matrix)
+        for seeds in (
+            KNOWLEDGE[: options.rooms],
+            MODELLED[: options.modelled],
+            KNOWLEDGE[-options.held_out :],
+        )
+    )
+    tested = {name: [room[kind] for room in held_out] for name, kind in KINDS.items()}
     tested |= {name: [scene_room(name)] for name in options.scenes}
     print(
         f"{options.steps} steps, seeds {options.seeds}, {options.rooms} rooms, "
@@ -123,9 +136,12 @@ def main(arguments: Sequence[str]) -> None:
     for name, variant in VARIANTS.items():
         if options.only and options.only not in name and name != BASELINE:
             continue
+        if variant.get("modelled") and not modelled:
+            continue
         for seed in options.seeds:
+            lessons = [*rooms, *(modelled if variant.get("modelled") else [])]
             encoder, found_map, seconds = train_encoder(
-                rooms[: options.rooms], variant, options.steps, embeddings, seed
+                lessons, variant, options.steps, embeddings, seed
             )
             for measure, of in tested.items():
                 answers = [

@@ -19,6 +19,7 @@ REFERENCE = range(8000, 8100)  # views that a teacher's channels are computed fr
 HELD_OUT = range(9000, 9020)
 TRAINING = range(10_000, 20_000)  # the embedded teacher is trained on these
 KNOWLEDGE = range(20_000, 21_000)  # knowledge is taught on these
+MODELLED = range(22_000, 23_000)  # and on these, which are furnished with modelled pieces
 
 
 @dataclass

@@ -56,16 +56,22 @@ class Builder:
     count: int = 0
 
     def add(
-        self, label: str, material: int, frame: Frame, vertices: np.ndarray, triangles: np.ndarray
+        self,
+        label: str | None,
+        material: int,
+        frame: Frame,
+        vertices: np.ndarray,
+        triangles: np.ndarray,
     ) -> None:
-        """One solid, in the local coordinates of `frame`."""
+        """One solid, in the local coordinates of `frame`; label None: of no class."""
         rotation, origin = frame.rotation, np.asarray(frame.origin)
         centre = 0.5 * (vertices.min(0) + vertices.max(0))
         order = np.argsort(-np.ptp(vertices, axis=0), kind="stable")
         self.frames.append((origin + rotation @ centre, np.eye(3)[order] @ rotation.T))
         self.vertices.append(vertices @ rotation.T + origin)
         self.triangles.append(triangles + self.count)
-        self.tags.append((CLASS_NAMES.index(label), material, len(triangles)))
+        number = -1 if label is None else CLASS_NAMES.index(label)
+        self.tags.append((number, material, len(triangles)))
         self.count += len(vertices)
 
     def box(

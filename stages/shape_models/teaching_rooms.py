@@ -1,7 +1,9 @@
-"""Generated rooms to train the point encoder on: points, shape, a 2D teacher's features."""
+"""Rooms to train the point encoder on: points, shape, features of a 2D teacher or the truth."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,10 +20,14 @@ from chebsplat.splats.gaussians import local_shape
 from chebsplat.stages.reconstruction.dense import SIDE, depth_of_photos, reduced
 from chebsplat.stages.reconstruction.thinning import thin
 from chebsplat.stages.settings import TeachSection
+from chebsplat.stages.shape_models.answers import units
 from chebsplat.stages.sources.generated import photograph
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
-from chebsplat.synthetic import layout
-from chebsplat.synthetic.layout import KNOWLEDGE
+from chebsplat.stages.teacher_models.text_encoder import text_embeddings
+from chebsplat.synthetic import CLASS_NAMES, layout
+from chebsplat.synthetic.catalogue import FOLDER
+from chebsplat.synthetic.furnished import Catalogue, furnished
+from chebsplat.synthetic.layout import KNOWLEDGE, MODELLED
 from chebsplat.synthetic.rays import RayCaster, intrinsics, walk
 from chebsplat.synthetic.shuffled import jitter, shuffled
 
@@ -55,30 +61,61 @@ class Room(NamedTuple):
 def rooms_of(
     seed: int, settings: TeachSection, network: TeacherInference, matrix: np.ndarray
 ) -> list[Room]:
-    """Four versions of a generated room with the teacher's features: by depth, with worn points
-    (`worn`), by the depth of few photos, and by a sweep of photos (`swept`).
+    """Four versions of a room: by depth, with worn points (`worn`), by the depth of few photos, and
+    by a sweep of photos (`swept`); with the teacher's features, or, of modelled rooms,
+    the embeddings of the true labels.
 
-    Args: seed: of `synthetic.seeds.KNOWLEDGE`; matrix [C, d]: from the teacher's channels to those
-      of scenes.
+    Args: seed: of `synthetic.layout.KNOWLEDGE` or `MODELLED`; matrix [C, d]: from the teacher's
+      channels to those of scenes.
     Raises: ValueError on another seed.
-    Choices: labels serve for measuring alone. Worn points have the teacher's features of the places
-      that they were moved from; points of few photos, and of a sweep, those of all photos. Every
-      other room of few photos is stretched, too, as proportions of worlds differ. Where the sweep
-      finds nothing, the version by depth comes once more.
+    Choices: labels of generated rooms serve for measuring alone. Worn points have the features of
+      the places that they were moved from; points of few photos, and of a sweep, those of all
+      photos. Every other room of few photos is stretched, too, as proportions of worlds differ.
+      Where the sweep finds nothing, the version by depth comes once more.
     """
-    if seed not in KNOWLEDGE:
-        raise ValueError(f"seed {seed} is not one for knowledge: {KNOWLEDGE}")
-    rng = np.random.default_rng([seed, 4])
+    if seed not in KNOWLEDGE and seed not in MODELLED:
+        raise ValueError(f"seed {seed} is not one for knowledge: {KNOWLEDGE}, {MODELLED}")
     images, depth, labels, K, poses = photographed(seed, settings.n_views)
-    Ks = np.tile(K, (len(poses), 1, 1))
-    grid, _ = network.grid(images[0], 4)
-    features = np.stack(
-        [network.features(image, grid, (1.0,), False, f"room {seed}") @ matrix for image in images]
+    if seed in KNOWLEDGE:
+        grid, _ = network.grid(images[0], 4)
+        views = (network.features(image, grid, (1.0,), False, f"room {seed}") for image in images)
+        return versions(
+            seed, settings, images, depth, labels, [v @ matrix for v in views], K, poses
+        )
+    blank = [np.ones((HEIGHT // 4, WIDTH // 4, 1), np.float32)] * len(images)
+    embeddings = units(text_embeddings(list(CLASS_NAMES), network.teacher) @ matrix)
+    rooms = versions(seed, settings, images, depth, labels, blank, K, poses)
+    return [by_truth(room, embeddings.astype(np.float32)) for room in rooms]
+
+
+def by_truth(room: Room, embeddings: np.ndarray) -> Room:
+    """A room with the embeddings [L, d] of its true labels; a point without one counts as not
+    visible.
+    """
+    n_views = np.where(room.labels < 0, 0, room.n_views)
+    return room._replace(features=embeddings[room.labels.clip(0)], n_views=n_views)
+
+
+def versions(
+    seed: int,
+    settings: TeachSection,
+    images: np.ndarray,
+    depth: np.ndarray,
+    labels: np.ndarray,
+    features: Sequence[np.ndarray],
+    K: np.ndarray,
+    poses: np.ndarray,
+) -> list[Room]:
+    """The four versions of a room, by its photos and the features [h, w, d] of each."""
+    rng, Ks, d = (
+        np.random.default_rng([seed, 4]),
+        np.tile(K, (len(poses), 1, 1)),
+        features[0].shape[-1],
     )
     count = round(settings.n_points * rng.uniform(*DENSITY))
     means, eyes, named = surface(depth, labels, K, poses, count, rng)
     clean = described(means, eyes)
-    mean, n_views = averaged(means, depth, features, features.shape[-1], Ks, poses)
+    mean, n_views = averaged(means, depth, features, d, Ks, poses)
     moved, rows, adrift = worn(means, clean.normals, rng)
     n_views_worn = np.where(adrift, 0, n_views[rows])
     rooms = [
@@ -87,15 +124,13 @@ def rooms_of(
     ]
     few = np.sort(rng.permutation(len(poses))[: int(np.exp(rng.uniform(*np.log(FEW_VIEWS))))])
     some, lookers, called = surface(depth[few], labels[few], K, poses[few], count, rng)
-    mean, n_views = averaged(some, depth, features, features.shape[-1], Ks, poses)
+    mean, n_views = averaged(some, depth, features, d, Ks, poses)
     stretch = rng.uniform(*STRETCH, 3) if rng.random() < 0.5 else np.ones(3)
     rooms.append(Room(described(some * stretch, lookers * stretch), mean, n_views, called))
     sweep = swept(images, depth, K, poses, rng)
     if len(sweep.means) <= N_NEIGHBORS:
         return [*rooms, rooms[0]]
-    mean, n_views = averaged(
-        sweep.means, depth, features, features.shape[-1], Ks, poses, SWEPT_WITHIN
-    )
+    mean, n_views = averaged(sweep.means, depth, features, d, Ks, poses, SWEPT_WITHIN)
     _, nearest = cKDTree(means).query(sweep.means)
     return [*rooms, Room(described(*sweep), mean, n_views, named[nearest])]
 
@@ -158,8 +193,11 @@ def photographed(
     seed: int, n_views: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Images, depth and labels [V, H, W, ...] of a room, K [3, 3] and poses [V, 4, 4]."""
-    kind = KINDS[seed % len(KINDS)]
-    room = shuffled(seed) if kind == "shuffled" else layout.build(kind.split()[-1], seed)
+    kind = "modelled" if seed in MODELLED else KINDS[seed % len(KINDS)]
+    if kind == "modelled":
+        room = furnished(seed, catalogue())
+    else:
+        room = shuffled(seed) if kind == "shuffled" else layout.build(kind.split()[-1], seed)
     if kind.startswith(("jittered", "shuffled")):
         jitter(room, np.random.default_rng([seed, 2]))
     caster, K = RayCaster(room.soup.vertices, room.soup.triangles), intrinsics(WIDTH, HEIGHT)
@@ -167,6 +205,12 @@ def photographed(
     views = [photograph(room, caster, K, pose, WIDTH, HEIGHT) for pose in poses]
     images, depth, labels = (np.stack(part) for part in zip(*views, strict=True))
     return images, depth, labels, K, poses
+
+
+@cache
+def catalogue() -> Catalogue:
+    """The modelled pieces that are installed here."""
+    return Catalogue(FOLDER)
 
 
 def surface(

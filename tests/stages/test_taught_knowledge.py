@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import onnxruntime
 import pytest
+from furniture_library import write_library
 from scipy.spatial import cKDTree
 from shared import INPUTS, TOY, published, run_stage
 from tiny_teachers import color_teacher, knowing_rooms
@@ -36,7 +37,15 @@ from chebsplat.stages.shape_models.answers import (
 )
 from chebsplat.stages.teacher_models.image_encoder import TeacherInference
 from chebsplat.synthetic import CLASS_NAMES
-from chebsplat.synthetic.layout import HELD_OUT, KNOWLEDGE, REFERENCE, SCENES, TRAINING
+from chebsplat.synthetic.furnished import Catalogue
+from chebsplat.synthetic.layout import (
+    HELD_OUT,
+    KNOWLEDGE,
+    MODELLED,
+    REFERENCE,
+    SCENES,
+    TRAINING,
+)
 
 
 @pytest.fixture
@@ -99,7 +108,7 @@ def test_another_teacher_has_none_until_it_is_taught(quick_plans, tmp_path):
 
 
 def test_no_room_of_knowledge_is_one_of_a_scene_a_test_or_the_teacher():
-    ranges = (SCENES, REFERENCE, HELD_OUT, TRAINING, KNOWLEDGE)
+    ranges = (SCENES, REFERENCE, HELD_OUT, TRAINING, KNOWLEDGE, MODELLED)
     assert sum(map(len, ranges)) == len(set().union(*ranges))
     with pytest.raises(ValueError, match="not one for knowledge"):
         teaching_rooms.rooms_of(101, TeachSection(), None, np.eye(3))
@@ -248,6 +257,24 @@ def test_a_swept_room_is_what_its_photos_tell_of_depth(network, monkeypatch):
         KNOWLEDGE[1], TeachSection(n_views=2, n_points=200), network, np.eye(3)
     )
     assert again[3] is again[0]
+
+
+def test_a_room_of_modelled_pieces_is_taught_its_true_classes(network, monkeypatch, tmp_path):
+    catalogue = Catalogue(write_library(tmp_path))
+    monkeypatch.setattr(teaching_rooms, "catalogue", lambda: catalogue)
+    embeddings = 2 * np.eye(len(CLASS_NAMES), 30)
+    monkeypatch.setattr(teaching_rooms, "text_embeddings", lambda *_: embeddings)
+    settings = TeachSection(n_views=10, n_points=3000)
+    rooms = teaching_rooms.rooms_of(MODELLED[0], settings, network, np.eye(30))
+    assert len(rooms) == 4
+    for room in rooms:
+        has_class = room.labels >= 0
+        assert 0.5 < has_class.mean() < 1  # the kitchen's fridge is of none of our classes
+        assert np.array_equal(
+            room.features[has_class], np.eye(len(CLASS_NAMES), 30)[room.labels[has_class]]
+        )
+        assert not room.n_views[~has_class].any()
+        assert (room.n_views[has_class] > 1).mean() > 0.3
 
 
 @pytest.mark.xdist_group("toy")
