@@ -349,7 +349,11 @@ def test_every_config_of_ours_can_be_planned(kind, tmp_path, monkeypatch):
             plan = Planner(quality=name).plan("toy", "train.steps=9", "plain")
             assert plan.title == f"toy@{name}+plain+train.steps=9"
             sides = {"draft": 640, "standard": 1000, "high": 1600}
-            assert plan.steps[0].sections["ingest"]["max_side"] == sides[name]
+            sections = {step.stage: step.sections for step in plan.steps}
+            assert sections["ingest"]["ingest"]["max_side"] == sides[name]
+            # toy's own cap holds where the quality says nothing
+            cap = 150_000 if name == "high" else 1500
+            assert sections["train"]["train"]["max_gaussians"] == cap
         elif kind == "sequences":
             assert set(scenes_of(name)) <= set(names("scenes"))
         elif "path" in read_toml(kind, name)["source"]:

@@ -88,8 +88,9 @@ def test_work_that_counts_nothing_says_now_and_then_that_it_goes_on(caplog, show
 
 
 def test_a_bar_that_stands_still_shows_that_time_goes_on(capsys, monkeypatch):
-    # those of tests before, whose streams are closed
+    # handlers of tests before have streams that are closed
     monkeypatch.setattr(logging.getLogger("chebsplat"), "handlers", [])
+    monkeypatch.setattr(logging.getLogger("chebsplat"), "propagate", False)
     progress = Progress(show=True, every=0.3)
     with progress.alive():
         for _ in progress.track(range(2), 3, "work"):
