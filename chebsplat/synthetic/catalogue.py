@@ -29,12 +29,12 @@ CM = 0.01
 
 @dataclass(frozen=True)
 class Piece:
-    """A model of a library: name, category, size [3] in metres (width, depth, height); elevation,
-    metres above the floor; top, height of the surface that carries things, None where none does;
-    rotation of the model [9], by rows, before its size is measured.
+    """A model in a library's archive: name, category, size [3] in metres (width, depth, height);
+    elevation, metres above the floor; top, height of the surface that carries things, None where
+    none does; rotation of the model [9], by rows, before its size is measured.
     """
 
-    library: Path
+    archive: Path
     model: str
     name: str
     category: str
@@ -108,7 +108,7 @@ def read_mesh(piece: Piece) -> Mesh:
     Raises: InputError naming a library whose file of the piece cannot be read.
     Choices: textures do not count: shape is what such rooms teach.
     """
-    with opened(piece.library) as files:
+    with opened(piece.archive) as files:
         lines = files.read(piece.model).decode("latin-1").splitlines()
         folder = PurePosixPath(piece.model).parent
         colors: dict[str, tuple[float, float, float]] = {}

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from chebsplat.cameras import centers
 from chebsplat.errors import InputError
 from chebsplat.synthetic import furniture as put
 from chebsplat.synthetic import layout
@@ -120,7 +121,7 @@ def furnished(seed: int, catalogue: Catalogue) -> layout.Room:
     rng = np.random.default_rng([seed, 7])
     recipe = RECIPES[seed % len(RECIPES)]
     w, d, h = size = (rng.uniform(*recipe.sides), rng.uniform(*recipe.sides), rng.uniform(2.4, 3.0))
-    furnishing = Furnishing(catalogue, recipe, rng, size, places_of(walk(size, 80, seed)))
+    furnishing = Furnishing(catalogue, recipe, rng, size, centers(walk(size, 80, seed)))
     furnishing.furnish()
     centres = np.stack(
         [rng.uniform(0.2, 0.8, 2) * w, rng.uniform(0.3, 0.7, 2) * d, np.full(2, h - 0.05)], 1
@@ -265,15 +266,17 @@ class Furnishing:
             return
         for group in rng.choice(self.recipe.things, rng.integers(5)):
             thing = self.draw(str(group))
-            if max(thing.size) < WIDEST_THING and thing.size[1] < piece.size[1]:
-                x, y = (np.array(piece.size[:2]) - thing.size[:2]).clip(0) * rng.uniform(
-                    -0.5, 0.5, 2
-                )
+            room = INNER * np.array(piece.size[:2]) - thing.size[:2]
+            if max(thing.size) < WIDEST_THING and room.min() > 0:
+                x, y = room * rng.uniform(-0.5, 0.5, 2)
                 y += (piece.size[1] - thing.size[1]) / 2
                 self.place(str(group), thing, frame.moved(x, y, top, rng.uniform(-0.3, 0.3)))
-        books = frame.moved(rng.uniform(-0.3, 0.3) * piece.size[0], piece.size[1] / 2 - 0.1, top)
-        if rng.random() < 0.3 and piece.size[1] > 0.3 and self.occupy(books, (0.35, 0.25, 0.1)):
-            put.lying_books(self.builder, books, self.palette.books, rng)
+        room = INNER * np.array(piece.size[:2]) - BOOKS[:2]
+        if rng.random() < 0.3 and room.min() > 0:
+            slide = room[0] * rng.uniform(-0.5, 0.5)
+            books = frame.moved(slide, (piece.size[1] - BOOKS[1]) / 2, top)
+            if self.occupy(books, BOOKS):
+                put.lying_books(self.builder, books, self.palette.books, rng)
 
     def set_up_workplace(self, desk: Piece, frame: Frame) -> None:
         """A screen, a keyboard and a chair at a desk."""
@@ -375,11 +378,6 @@ class Furnishing:
             for z in np.arange(high - rng.uniform(0.2, 0.9) * window.size[2], high, 0.05):
                 slat = (-half, near, z), (half, far, z + 0.03)
                 b.box("blinds", self.palette.slat, frame, *slat)
-
-
-def places_of(poses: np.ndarray) -> np.ndarray:
-    """Places [V, 3] of cameras of poses [V, 4, 4], cam_from_world."""
-    return np.asarray(-np.einsum("vij,vi->vj", poses[:, :3, :3], poses[:, :3, 3]))
 
 
 def box_of(frame: Frame, size: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:

@@ -24,7 +24,7 @@ PACKAGES = {
     "kernels": set(),
     "cameras": set(),
     "settings": set(),
-    "synthetic": set(),
+    "synthetic": {"cameras"},
     "labels": set(),
     "photos": {"cameras", "kernels"},
     "splats": {"kernels"},

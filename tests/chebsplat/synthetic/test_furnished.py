@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from furniture_library import STOCK, write_library
 
+from chebsplat.cameras import centers
 from chebsplat.errors import InputError
 from chebsplat.synthetic import CLASS_NAMES, furnished
 from chebsplat.synthetic.catalogue import read_catalogue, read_mesh
-from chebsplat.synthetic.furnished import PIECES, RECIPES, Catalogue, Furnishing, places_of
+from chebsplat.synthetic.furnished import PIECES, RECIPES, Catalogue, Furnishing
 from chebsplat.synthetic.rays import walk
 
 SIZE = (4.5, 4.0, 2.7)
@@ -86,7 +87,7 @@ def test_pieces_stand_apart_in_the_room_on_the_floor_or_a_top_or_hang_away_from_
         pieces.append((piece, corners.min(0), corners.max(0)))
 
     monkeypatch.setattr(Furnishing, "add", add)
-    eyes = places_of(walk(SIZE, 40, 3))
+    eyes = centers(walk(SIZE, 40, 3))
     for seed in range(4):
         pieces.clear()
         rng = np.random.default_rng(seed)
