@@ -52,6 +52,9 @@ BENCHMARKS = {
         "teachers.trust",
         "whether views' agreement ranks 2D teachers as true mIoU does; no training",
     ),
+    "sheets": Benchmark(
+        "teachers.sheets", "pictures of modelled furniture and its rooms; nothing is measured"
+    ),
     "mesh": Benchmark(
         "scenes.mesh",
         "the mesh against exact depth: F-score, labels, seconds by voxel",

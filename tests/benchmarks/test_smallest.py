@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from furniture_library import write_library
 from PIL import Image
 from shared import ROOT, data
 
@@ -38,9 +39,10 @@ SMALLEST = {
     "unposed": "{photos}",
     "lenses": "--views 1",
     "query": "--folders {work}",
+    "sheets": "--furniture {furniture} --rooms 1",
     "stability": "--only pruning",
 }
-PRINT_ALONE = ("cost", "unposed", "lenses")
+PRINT_ALONE = ("cost", "unposed", "lenses", "sheets")
 BY_ITSELF = {"gpu"}  # test_what_awaits_a_gpu_runs_to_its_end_where_the_cpu_stands_in
 
 
@@ -125,7 +127,7 @@ def opensplat_standin(folder):
 def test_a_benchmark_runs_to_its_end_at_its_smallest_size(name, work, tmp_path, monkeypatch):
     photos = capture_of_photos(tmp_path / "photos") if name == "unposed" else ""
     words = {"work": work, "name": work.name, "out": tmp_path, "photos": photos}
-    words["standin"] = opensplat_standin(tmp_path)
+    words["standin"], words["furniture"] = opensplat_standin(tmp_path), write_library(tmp_path)
     if name == "teaching":
         from benchmarks.teachers import teaching
 
