@@ -15,13 +15,21 @@ RIGID = 1e-3  # largest entry of |RRᵀ − I|
 
 @dataclass
 class Cameras(Record):
-    """names of V views; Ks f64 [V, 3, 3] pixels, cam_from_world [V, 4, 4]; size of the images."""
+    """names of V views; Ks f64 [V, 3, 3] pixels, cam_from_world [V, 4, 4]; size of the images;
+    exposures f64 [V, 3]: stops by channel that a photo from there is expected to have more than a
+    picture of the scene; None: none.
+    """
 
     names: list[str]
     Ks: Annotated[np.ndarray, Array("float64", ("view", 3, 3), "pixels")]
     cam_from_world: Annotated[np.ndarray, Array("float64", ("view", 4, 4), "scene units")]
     width: int
     height: int
+    exposures: Annotated[np.ndarray | None, Array("float64", ("view", 3), "stops")] = None
+
+    def stops(self, index: int) -> np.ndarray:
+        """Exposure [3] that a photo from a view is expected to have."""
+        return np.zeros(3) if self.exposures is None else self.exposures[index]
 
 
 def check_cameras(

@@ -27,6 +27,7 @@ from chebsplat.formats.scene import Scene
 from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import lacking
+from chebsplat.photos.exposures import relit
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.measuring.image_quality import (
     covisible_figures,
@@ -43,7 +44,7 @@ log = logging.getLogger("chebsplat")
 
 
 def run(job: Job) -> None:
-    """Measure the exported scene on its protocol's views (docs/method.md, section 10).
+    """Measure the exported scene on its protocol's views (docs/method.md, sections 10 and 15).
 
     Reads `capture`, `scene` and, for the teacher's own figures, `features`. Writes `evaluation`.
     """
@@ -82,6 +83,7 @@ def run(job: Job) -> None:
     names = [scene.cameras.names[k] for k in places]
     renderer = SceneRenderer(scene.parameters, job.device, scene.cameras.Ks)
     cameras = [camera(scene, k) for k in places]
+    stops = {name: scene.cameras.stops(k) for name, k in zip(names, places, strict=True)}
     pictures: dict[str, Any] = {"truth": np.stack([capture.images[row[name]] for name in names])}
     measured = capture.protocol | {"resolution": "x".join(map(str, capture.size))}
     figures: dict[str, Any] = {"names": names, "protocol": measured, "source": capture.source}
@@ -92,19 +94,23 @@ def run(job: Job) -> None:
     segmentation = segmented(job, protocol, views, capture, scene, renderer)
     for _ in views:  # views that the protocol did not use
         pass
+    job.facts["layout_error"] = layout_error(job, scene, cameras[0], stacks["renders"][0])
+    lit = zip(stacks["renders"], stops.values(), strict=True)
+    stacks["renders"] = [relit(image, more) for image, more in lit]
     pictures |= {name: np.stack(maps) for name, maps in stacks.items()}
     masks = None if capture.loss_mask is None else [capture.loss_mask[row[name]] for name in names]
     figures["image"] = image_figures(pictures["renders"], pictures["truth"], masks, lpips)
+    if scene.cameras.exposures is not None:
+        figures["image"]["exposure_stops"] = float(np.abs(np.stack([*stops.values()])).max())
     figures["n_gaussians"] = len(scene.parameters["means"])
     figures["bytes"] = scene.summary["bytes"]
     figures |= timings(job, renderer, cameras, scene.labels is not None)
-    job.facts["layout_error"] = layout_error(job, scene, cameras[0], pictures["renders"][0])
     figures["lpips"] = figures["image"]["lpips"]
     if lpips is None:
         job.left_out("LPIPS", "evaluate.lpips_weights names no file: not measured")
     else:
         figures["lpips_net"] = {"net": NET, "normalize": NORMALIZE}
-    as_taken = figures_as_taken(capture, renderer, dict(zip(names, cameras, strict=True)))
+    as_taken = figures_as_taken(capture, renderer, dict(zip(names, cameras, strict=True)), stops)
     if as_taken is not None:
         figures["image"]["as_taken"] = as_taken
     if not protocol.RULE.on_training:

@@ -247,6 +247,11 @@ def summary_rows(
     rows = [
         Figure(f"PSNR, dB (8-bit, mean over views{of})", image["psnr"], form="{:.2f}"),
         Figure("PSNR after a colour fit by view, dB", image.get("psnr_fit"), form="{:.2f}"),
+        Figure(
+            "most exposure expected of these photos, stops",
+            image.get("exposure_stops", ""),
+            form="{:.2f}",
+        ),
         *taken_rows(image.get("as_taken")),
         *covisible_rows(image.get("covisible")),
         Figure("SSIM (window 11, σ 1.5)", image["ssim"], form="{:.4f}"),

@@ -129,7 +129,12 @@ class PoseSection(Section):
 
 
 class SfmSection(Section):
-    max_points: int = number(36_000, "initial Gaussians, at most", 16, 2_000_000)
+    max_points: int | None = number(
+        None,
+        "initial Gaussians, at most; default: nine tenths of those that a training may grow to",
+        16,
+        2_000_000,
+    )
     spacing: Literal["color", "even"] = setting(
         "color",
         "of points of measured depth: closer where colours change, or as far apart everywhere",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
 from chebsplat.labels.agreement import project
 from chebsplat.photos.colors import tell_of
+from chebsplat.settings import default_gaussians
 from chebsplat.splats.gaussians import local_shape
 from chebsplat.stages.reconstruction.dense import MOST, backdrop, covered, swept, wants_more
 from chebsplat.stages.reconstruction.enclosure import enclosed
@@ -20,15 +22,15 @@ from chebsplat.stages.reconstruction.pose_check import wants_adjustment
 from chebsplat.stages.reconstruction.thinning import by_color, edge_of, thin
 from chebsplat.stages.reconstruction.triangulation import reconstruct
 from chebsplat.stages.runtime.command import Job
-from chebsplat.stages.settings import SfmSection
 
 log = logging.getLogger("chebsplat")
 # the fields of `Points` but the local shape, and seen_from [N]: the view that a point is from
 Cloud = dict[str, Any]
 N_NEIGHBORS = 16  # that give a point its normal and covariance
-CANDIDATES = 16  # pixels with depth that are drawn for each point of `sfm.max_points`
+POINTS_SHARE = 0.9  # of the Gaussians that a training may grow to
+CANDIDATES = 16  # pixels with depth that are drawn for each point at most
 TRIED = 2000  # points that are compared with depth
-EVEN = 0.55  # of `sfm.max_points`: spaced evenly whatever the colours, for shape
+EVEN = 0.55  # of the points: spaced evenly whatever the colours, for shape
 
 
 def run(job: Job) -> None:
@@ -39,28 +41,27 @@ def run(job: Job) -> None:
     `sfm.matching` is not `auto`.
     """
     settings, capture = job.config.sfm, Capture.read(job.inputs["capture"])
+    most = settings.max_points or default_points(capture)
     spares = capture.points is not None or capture.depth is not None
     use_poses = capture.cam_from_world is not None and settings.matching == "auto" and spares
     adjusted = wants_adjustment(job, capture, settings) if use_poses else None
     use_poses = use_poses and not adjusted
     if use_poses and capture.points is not None:
         job.left_out("feature matching", "poses are given, and points by the source")
-        cloud = from_source(capture, settings)
+        cloud = from_source(capture, most)
     elif use_poses:
         job.left_out("feature matching", "poses and depth are given: points come from depth")
-        _, cloud = reduced(
-            from_depth(job, capture, settings), settings.max_points, settings.spacing
-        )
+        _, cloud = reduced(from_depth(job, capture, most), most, settings.spacing)
     else:
-        cloud = reconstruct(job, capture, settings, adjusted)
+        cloud = reconstruct(job, capture, settings, most, adjusted)
         if "poses_kept" in cloud["notes"] and capture.depth is not None:
-            measured = from_depth(job, capture, settings, cloud["cam_from_world"])
-            cloud = filled(cloud, measured, settings.max_points, settings.spacing)
+            measured = from_depth(job, capture, most, cloud["cam_from_world"])
+            cloud = filled(cloud, measured, most, settings.spacing)
     depths = None
     if len(cloud["means"]) >= 16 and wants_more(job, capture, cloud, settings):
         more = swept(job, capture, cloud)
         depths = more.pop("depths")
-        cloud = filled(cloud, more, min(MOST, settings.max_points), name="n_swept")
+        cloud = filled(cloud, more, min(MOST, most), name="n_swept")
     if (n := len(cloud["means"])) < 16:
         raise DataFailure(
             f"only {n} points were found, at least 16 are needed; add views with more overlap"
@@ -90,6 +91,12 @@ def run(job: Job) -> None:
         cloud["notes"],
         depths,
     ).write(job.out)
+
+
+def default_points(capture: Capture) -> int:
+    """Points of a scene, at most, by the pixels of its training photos."""
+    n_pixels = int((~capture.is_test).sum()) * math.prod(capture.size)
+    return round(POINTS_SHARE * default_gaussians(n_pixels))
 
 
 def with_sides(job: Job, capture: Capture, cloud: Cloud, in_unit: bool) -> Cloud:
@@ -189,19 +196,17 @@ def reduced(cloud: Cloud, count: int, spacing: str) -> tuple[np.ndarray, Cloud]:
     return rows, cloud | same | {"colors": colors, "tracks": tracks, "notes": notes}
 
 
-def from_depth(
-    job: Job, capture: Capture, settings: SfmSection, poses: np.ndarray | None = None
-) -> Cloud:
-    """Points from depth of training views, CANDIDATES times `sfm.max_points`, in random order.
+def from_depth(job: Job, capture: Capture, most: int, poses: np.ndarray | None = None) -> Cloud:
+    """Points from depth of training views, CANDIDATES times `most`, in random order.
 
     Args: poses [V, 4, 4]: of the capture's views where they were adjusted.
     Choices: test views give no points; pixels are drawn evenly over views.
     """
     assert capture.cam_from_world is not None and capture.depth is not None
-    rng = np.random.default_rng(settings.seed)
+    rng = np.random.default_rng(job.config.sfm.seed)
     poses = capture.cam_from_world if poses is None else poses
     used = np.flatnonzero(~capture.is_test)
-    per_view = max(CANDIDATES * settings.max_points // max(len(used), 1), 16)
+    per_view = max(CANDIDATES * most // max(len(used), 1), 16)
     means, colors, view_of = [], [], []
     for view, status in job.progress.track(used, len(used), "depth"):
         depth, image = capture.depth[view], capture.images[view]
@@ -232,15 +237,15 @@ def from_depth(
     }
 
 
-def from_source(capture: Capture, settings: SfmSection) -> Cloud:
-    """The source's own points that project into a training view, thinned to one a voxel.
+def from_source(capture: Capture, most: int) -> Cloud:
+    """The source's own points that project into a training view, at most `most`, one a voxel.
 
     Choices: a point is visible from the nearest such view, which orients its normal; occlusion is
       not tested. Points without colours, or with colours unlike the photos' (`tell_of`), take the
       pixels there.
     """
     assert capture.cam_from_world is not None and capture.points is not None
-    rows = thin(capture.points, settings.max_points)
+    rows = thin(capture.points, most)
     points, (width, height) = capture.points[rows].astype(np.float64), capture.size
     distance, view_of = np.full(len(points), np.inf), np.full(len(points), -1)
     pixels, colors = np.zeros((len(points), 3), np.uint8), capture.point_colors

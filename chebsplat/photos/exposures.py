@@ -5,9 +5,10 @@ Exposures are f64 [V, 3]: stops (log2 of linear light) by channel, relative to t
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from chebsplat.cameras import centers
 
@@ -21,8 +22,8 @@ MOST = 300_000  # sightings of points that are looked at, or about as many
 DARK, BRIGHT = 0.005, 0.85
 # of medians by point and by view, in turns: more for what drifts along a path, which stays
 ROUNDS, SETTLED = 30, 1e-4
-MOST_VIEWS = 1000  # of one process: every second view makes two of 2000
-# of `own_part`: how far apart views share, in median distances and radians
+MOST_VIEWS = 1000  # whose exposures tell what to expect of others
+# how far apart views share an exposure, in median distances and radians
 REACHES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 RATIOS = 10.0 ** np.arange(-4, 4.1, 0.25)  # what is a photo's own over what is shared, as variances
 # orthonormal
@@ -136,53 +137,61 @@ def _medians(values: np.ndarray, group: np.ndarray, n_groups: int = 0) -> np.nda
     return result
 
 
-def own_part(exposures: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
-    """Part of exposures [V, 3] that is a photo's own, not shared by views about it; 0 where NaN.
+def expected_exposures(
+    exposures: np.ndarray, cam_from_world: np.ndarray, at: np.ndarray
+) -> np.ndarray:
+    """Exposures [Q, 3] that photos from the poses `at` [Q, 4, 4] may be expected to have, by those
+    [V, 3] of photos from other poses; 0, the mean, where fewer than three are known.
 
-    Choices: what changes smoothly with where a camera stands and looks is left in the photos: views
-      between them, test views too, have it, and a scene can show it. Exposures are a Gaussian
-      process over camera centres, in median distances, and directions (Matérn, 3/2), plus noise
-      that is each photo's own; its reach and the noise's share are those of the largest marginal
-      likelihood, by brightness and by hue.
+    Args:    exposures: NaN where unknown.
+    Choices: exposures are a Gaussian process over camera centres, in median distances, and
+      directions (Matérn, 3/2), plus noise that is each photo's own and cannot be expected; its
+      reach and the noise's share are those of the largest marginal likelihood, by brightness and by
+      hue. Of more than MOST_VIEWS photos, every second counts, or every third.
     """
-    own = np.zeros_like(exposures)
-    finite = np.flatnonzero(np.isfinite(exposures).all(1))
-    every = -(-len(finite) // MOST_VIEWS)
-    for some in (finite[start::every] for start in range(every)):
-        if len(some) >= 3:
-            own[some] = _own_part(exposures[some], cam_from_world[some])
-    return own
-
-
-def _own_part(exposures: np.ndarray, cam_from_world: np.ndarray) -> np.ndarray:
-    """`own_part` of exposures that are all known, of not too many views."""
-    eye, forward = centers(cam_from_world), cam_from_world[:, 2, :3]
-    apart = np.linalg.norm(eye[:, None] - eye, axis=-1)
-    place = np.concatenate(
-        [eye / (np.median(apart[apart > 0]) if apart.any() else 1.0), forward], 1
+    known = np.flatnonzero(np.isfinite(exposures).all(1))
+    if len(known) < 3:
+        return np.zeros((len(at), 3))
+    some = known[:: -(-len(known) // MOST_VIEWS)]
+    eyes = centers(cam_from_world[some])
+    apart = cdist(eyes, eyes)
+    unit = np.median(apart[apart > 0]) if apart.any() else 1.0
+    here, there = (
+        np.concatenate([centers(poses) / unit, poses[:, 2, :3]], 1)
+        for poses in (cam_from_world[some], at)
     )
-    distance = np.sqrt(3) * np.linalg.norm(place[:, None] - place, axis=-1)
-    kernels = ((1 + distance / reach) * np.exp(-distance / reach) for reach in REACHES)
-    spectra = [tuple(np.linalg.eigh(kernel)) for kernel in kernels]
-    axes = exposures @ BRIGHTNESS_AND_HUES.T
-    return np.stack([_noise_of(values, spectra) for values in axes.T], 1) @ BRIGHTNESS_AND_HUES
+    spectra = []
+    for reach in REACHES:
+        eigenvalues, vectors = np.linalg.eigh(_covariance(here, here, reach))
+        spectra.append((eigenvalues, vectors, _covariance(there, here, reach) @ vectors))
+    axes = exposures[some] @ BRIGHTNESS_AND_HUES.T
+    return np.stack([_expected(values, spectra) for values in axes.T], 1) @ BRIGHTNESS_AND_HUES
 
 
-def _noise_of(values: np.ndarray, spectra: list[tuple[np.ndarray, ...]]) -> np.ndarray:
-    """The noise in values [V] of unknown mean, whose covariance is one of these (eigenvalues,
-    eigenvectors) plus one of RATIOS, times a factor.
+def _covariance(places: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray:
+    """Covariances [N, M] of values at places [N, 6] and [M, 6], their variance being 1."""
+    distance = np.sqrt(3) * cdist(places, others) / reach
+    covariance: np.ndarray = (1 + distance) * np.exp(-distance)
+    return covariance
+
+
+def _expected(values: np.ndarray, spectra: Sequence[tuple[np.ndarray, ...]]) -> np.ndarray:
+    """Values [Q] expected by values [V] of unknown mean, whose covariance is one of these
+    (eigenvalues, eigenvectors) plus one of RATIOS, times a factor; third of each: covariances of
+    the Q with the V, in the eigenvectors' basis.
     """
+    best, expected = -np.inf, np.full(len(spectra[0][2]), values.mean())
     if np.ptp(values) < 1e-9:
-        return np.zeros_like(values)
-    best, noise = -np.inf, np.zeros_like(values)
-    for eigenvalues, vectors in spectra:
+        return expected
+    for eigenvalues, vectors, across in spectra:
         rotated, ones = vectors.T @ values, vectors.sum(0)
         for ratio in RATIOS:
             weights = 1 / (eigenvalues.clip(0) + ratio)
             total = (weights * ones**2).sum()
-            residual = rotated - (weights * ones * rotated).sum() / total * ones
+            mean = (weights * ones * rotated).sum() / total
+            residual = rotated - mean * ones
             square = (weights * residual**2).sum()
             likelihood = -(len(values) - 1) * np.log(square) + np.log(weights).sum() - np.log(total)
             if likelihood > best:
-                best, noise = likelihood, vectors @ (ratio * weights * residual)
-    return noise
+                best, expected = likelihood, mean + across @ (weights * residual)
+    return expected

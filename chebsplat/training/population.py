@@ -108,8 +108,9 @@ class Population:
             self.settings,
             {name: value.detach() for name, value in self.model.raw.items()},
         )
-        left = max(settings.max_gaussians - len(self.model), 0)
-        budget = min(left, settings.max_gaussians // max(settings.n_densify, 1))
+        most = settings.max_gaussians
+        assert most is not None
+        budget = min(max(most - len(self.model), 0), most // max(settings.n_densify, 1))
         self.n_grown += 1
         if budget == 0:
             return

@@ -18,7 +18,7 @@ from chebsplat.pipelines.planning.needs import UNASKED
 from chebsplat.pipelines.planning.plan import Plan, Step
 from chebsplat.pipelines.planning.raw import raw_files
 from chebsplat.pipelines.work import finished, store
-from chebsplat.settings import default_steps
+from chebsplat.settings import default_gaussians, default_steps
 from chebsplat.stages.registry import STAGES
 from chebsplat.stages.runtime.machine import processor
 from chebsplat.stages.runtime.progress import duration
@@ -113,7 +113,7 @@ def facts_of(
         train = stages.get("train", {}).get("train", {})
         teacher = stages.get("teacher", {}).get("teacher", {})
         all_pairs = pose.get("matching") == "exhaustive" or n <= EXHAUSTIVE
-        n_training = n - n // (ingest["test_every"] or 8)
+        n_training_pixels = (n - n // (ingest["test_every"] or 8)) * reduced * 1e6
         return SceneFacts(
             source["kind"],
             n,
@@ -122,9 +122,9 @@ def facts_of(
             n * reduced,
             area * min(1, OWN_SIDE / side) ** 2,
             n * (n - 1) // 2 if all_pairs else round(0.6 * pose.get("n_matched", 10) * n),
-            train.get("steps") or default_steps(n_training * reduced * 1e6),
+            train.get("steps") or default_steps(n_training_pixels),
             train.get("seconds"),
-            train.get("max_gaussians", 0),
+            train.get("max_gaussians") or default_gaussians(n_training_pixels),
             train.get("method") == "printed",
             semantic,
             teacher.get("model") is not None,

@@ -24,6 +24,7 @@ from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.kernels.threads import n_threads
 from chebsplat.labels.agreement import project, unhidden
+from chebsplat.photos.exposures import relit
 from chebsplat.render import PARTS, SceneRenderer, focals, frame_parts
 from chebsplat.training.losses import ssim
 from chebsplat.views import View
@@ -108,12 +109,15 @@ def _posed_depth(
 
 
 def figures_as_taken(
-    capture: Capture, renderer: SceneRenderer, cameras: dict[str, View]
+    capture: Capture,
+    renderer: SceneRenderer,
+    cameras: dict[str, View],
+    stops: dict[str, np.ndarray],
 ) -> dict[str, Any] | None:
     """PSNR, dB, and SSIM on the test photos as they were taken, of up to 1600 pixels a side, and
     `size`, width and height of most of them; None where none was undistorted or reduced.
 
-    Args:    cameras: of the capture's views, by name.
+    Args:    cameras: of the capture's views, by name; stops [3]: their photos' expected exposures.
     Choices: the scene is rendered at the photo's resolution, and interpolated, by cubic splines, at
       the photo's pixels. Pixels outside the undistorted view, or masked in it, do not count; for
       SSIM they take the photo's colour.
@@ -132,7 +136,7 @@ def figures_as_taken(
         truth = np.ascontiguousarray(capture.taken[k][:height, :width])
         finer = lens.mean_focal_length() / float(focals(cameras[name].K))
         view = enlarged(cameras[name], finer)
-        K, render = view.K.double().numpy(), renderer.render(view)[0]
+        K, render = view.K.double().numpy(), relit(renderer.render(view)[0], stops[name])
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(
             -1, 2
         )

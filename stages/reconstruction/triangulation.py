@@ -22,11 +22,12 @@ log = logging.getLogger("chebsplat")
 
 
 def reconstruct(
-    job: Job, capture: Capture, settings: SfmSection, adjusted: bool | None = None
+    job: Job, capture: Capture, settings: SfmSection, most: int, adjusted: bool | None = None
 ) -> dict[str, Any]:
     """Match views, then triangulate their points.
 
-    Args:    adjusted: true to adjust the poses to the photos; None: where matches miss them.
+    Args:    most: points; adjusted: true to adjust the poses to the photos; None: where matches
+      miss them.
     Returns: names, Ks, cam_from_world; means, colors, seen_from, tracks; notes.
     Raises:  ConfigError where the capture has no poses.
     Choices: images are imported in the order of their names before extraction, which makes
@@ -63,7 +64,7 @@ def reconstruct(
         "%.2f px, %d points in %.1f views each",
         notes["reprojection_error_px"], model.num_points3D(), notes["track_length"],
     )  # fmt: skip
-    cloud = _collect(model, capture, [images[file_of(view)] for view in range(n)], settings)
+    cloud = _collect(model, capture, [images[file_of(view)] for view in range(n)], most)
     return cloud | {"notes": notes | moved}
 
 
@@ -98,7 +99,7 @@ def _collect(
     model: pycolmap.Reconstruction,
     capture: Capture,
     images: list[pycolmap.Image],
-    settings: SfmSection,
+    most: int,
 ) -> dict[str, Any]:
     """Arrays of the model: cameras, points that a training view sees, and colours from such views.
 
@@ -121,7 +122,7 @@ def _collect(
         if training and point.error <= 4:
             entries.append((point.xyz, elements, training[0]))
     entries.sort(key=lambda entry: -len(entry[1]))
-    entries = entries[: settings.max_points]
+    entries = entries[:most]
     colors = np.zeros((len(entries), 3), np.uint8)
     by_view: dict[int, list[int]] = {}
     for index, (_, _, first) in enumerate(entries):

@@ -21,14 +21,21 @@ from chebsplat.formats.points import Points, thinned
 from chebsplat.formats.splats import read_splats
 from chebsplat.formats.world import HERE, World
 from chebsplat.kernels.threads import n_threads
-from chebsplat.settings import DescribeSection, TrainSection
+from chebsplat.settings import DescribeSection, TrainSection, default_gaussians
 from chebsplat.splats.gaussians import initial_gaussians, sh0_of, surface_of
 from chebsplat.stages.runtime.command import Job
 from chebsplat.stages.runtime.progress import Progress
 from chebsplat.stages.settings import LiftSection
-from chebsplat.stages.training.defaults import LIFTED_FROM, OPEN, decided, evidence_of, resolved
+from chebsplat.stages.training.defaults import (
+    LIFTED_FROM,
+    OPEN,
+    decided,
+    evidence_of,
+    n_training_pixels,
+    resolved,
+)
 from chebsplat.stages.training.lifting import lifted_from
-from chebsplat.stages.training.photos import own_exposures
+from chebsplat.stages.training.photos import Exposures, exposures_of
 from chebsplat.stages.training.placing import in_frame
 from chebsplat.stages.training.views import training_views
 from chebsplat.training.model import SceneModel
@@ -42,11 +49,14 @@ KNOWLEDGE = "knowledge."  # begins the names of bases among a training's modules
 
 @dataclass
 class Inputs:
-    """Artifacts of a training. features: None without semantics."""
+    """Artifacts of a training. features: None without semantics; exposures: None where they are
+    not measured.
+    """
 
     capture: Capture
     points: Points
     features: Features | None = None
+    exposures: Exposures | None = None
 
 
 def read_inputs(job: Job) -> Inputs:
@@ -56,10 +66,10 @@ def read_inputs(job: Job) -> Inputs:
     """
     train = job.config.train
     capture = Capture.read(job.inputs["capture"])
-    points = within_cap(job, Points.read(job.inputs["points"]))
+    points = within_cap(job, capture, Points.read(job.inputs["points"]))
     learns = "features" in job.inputs and train.semantics and train.features == "trained"
     features = Features.read(job.inputs["features"]) if learns else None
-    return Inputs(capture, points, features)
+    return Inputs(capture, points, features, measure_exposures(job, capture, points))
 
 
 def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
@@ -71,18 +81,18 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
     """
     capture, points, features = inputs.capture, inputs.points, inputs.features
     evidence = evidence_of(job.config.train, capture, points, features)
-    exposures = _exposures(job, capture, points)
-    stops = job.facts.get("exposure_stops", {}).get("own")
-    train = resolved(job.config.train, replace(evidence, exposure_spread=stops))
+    spread = inputs.exposures.spread if inputs.exposures else None
+    train = resolved(job.config.train, replace(evidence, exposure_spread=spread))
     job.facts["decided"] = decided(job.config.train, train, features is not None)
     _note_left_out(job, train, features is not None, evidence.no_depth)
     # Our method's long operations are kernels, with threads of their own. What is left to torch is
     # short, and its threads wait for each other every time: for long on a shared machine.
     torch.set_num_threads(1 if train.method == "ours" else n_threads())
     model = model_of(points, features, train, job.config.describe, job.device, backend, capture)
-    undone = exposures if train.exposure == "measured" else None
-    if undone is not None:
-        log.info("exposures of photos differ by %.2f stops from those about them: undone", stops)
+    undone = None
+    if train.exposure == "measured" and inputs.exposures is not None:
+        undone = inputs.exposures.of_photos
+        log.info("exposures of photos differ by %.2f stops: undone", spread or 0.0)
     views = training_views(capture, points, features, bool(train.weight_depth), undone).to(
         job.device
     )
@@ -113,28 +123,27 @@ def knowledge_of(earlier: Path, model: PrintedScene) -> dict[str, Tensor]:
     return bases
 
 
-def _exposures(job: Job, capture: Capture, points: Points) -> np.ndarray | None:
-    """Differences of training photos' exposures from their neighbours' [V, 3], stops; None: not
-    measured. The spread becomes a fact.
-    """
+def measure_exposures(job: Job, capture: Capture, points: Points) -> Exposures | None:
+    """Exposures of the photos, whose spread becomes a fact; None where they are not needed."""
     mode = job.config.train.exposure
     if mode == "off" or (mode == "auto" and capture.source.get("kind") == "generated"):
         return None
-    exposures, job.facts["exposure_stops"] = own_exposures(capture, points)
+    exposures = exposures_of(capture, points)
+    job.facts["exposure_stops"] = exposures.spread
     return exposures
 
 
 def _why_no_exposure(train: TrainSection, stops: float | None) -> str:
     """Reason for leaving photos' exposures as they are. stops: their spread; None: not measured."""
     if stops is not None:
-        return f"photos differ by {stops:.2f} stops from those about them"
+        return f"photos differ by {stops:.2f} stops"
     return "train.exposure is off" if train.exposure == "off" else "views are generated, all alike"
 
 
 def _note_left_out(job: Job, train: TrainSection, has_semantics: bool, no_depth: str) -> None:
     """Note the parts that this training leaves out, and why. train: resolved."""
     requested = job.config.train
-    stops = job.facts.get("exposure_stops", {}).get("own")
+    stops = job.facts.get("exposure_stops")
     if requested.method == "printed":
         for what in ("depth loss", "exposure by photo"):
             job.left_out(what, PRINTED_METHOD)
@@ -226,7 +235,7 @@ def read_start(
     n = len(parameters["means"])
     if n == 0:
         raise InputError(f"{ply} holds no Gaussians; choose another train.start")
-    if n > train.max_gaussians:
+    if n > (train.max_gaussians or n):
         raise ConfigError(f"{ply} holds {n} Gaussians; set train.max_gaussians={n} or more")
     if capture is not None:
         cameras = Cameras(points.names, points.Ks, points.cam_from_world, *capture.size)
@@ -247,9 +256,10 @@ def read_start(
     return {name: torch.tensor(values, dtype=torch.float32) for name, values in raw.items()}
 
 
-def within_cap(job: Job, points: Points) -> Points:
+def within_cap(job: Job, capture: Capture, points: Points) -> Points:
     """The points that a training starts from: all, or `max_gaussians` of them."""
     n, most = len(points.means), job.config.train.max_gaussians
+    most = most or default_gaussians(n_training_pixels(capture, points))
     if n > most:
         job.left_out(f"{n - most} of {n} initial points", f"train.max_gaussians is {most}")
     return thinned(points, most, job.config.train.seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +11,7 @@ from chebsplat.errors import ConfigError
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.points import Points
-from chebsplat.settings import FEWEST_STEPS, PRINTED, TrainSection, default_steps
+from chebsplat.settings import FEWEST_STEPS, PRINTED, TrainSection, default_gaussians, default_steps
 from chebsplat.stages.training.views import disagreement, training_rows
 
 OPEN = (None, "auto")  # values of a setting that leave it open
@@ -19,7 +20,7 @@ TRAVEL, FASTEST = 10.0, 5e-2  # a features' rate: less than TRAVEL over all step
 DEPTH_WEIGHT = 0.8
 MOST_APART = 0.003  # of a point's depth, within which views agree on it
 LIFTED_FROM = 40  # views
-LEAST_SPREAD = 0.05  # stops between the photos' own exposures, from which on these are undone
+LEAST_SPREAD = 0.05  # stops between the photos' exposures, from which on these are undone
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Evidence:
     no_depth: reason for not using measured depth ("": it is used).
     labels: origin of labels with a confidence: `none`, `taught` (by the teacher), `given` (by the
       source); None: no teacher.
-    exposure_spread: of the photos' own exposures, stops; None: not measured.
+    exposure_spread: of the photos' exposures, stops; None: not measured.
     """
 
     n_views: int
@@ -98,6 +99,10 @@ DEFAULTS = {  # in this order: a later one may depend on an earlier
         lambda _, evidence: default_steps(evidence.n_pixels),
         "pixels of the training photos: 280 a megapixel, from 1000 to 3000",
     ),
+    "max_gaussians": Default(
+        lambda _, evidence: default_gaussians(evidence.n_pixels),
+        "pixels of the training photos: 40,000, above 40 million by the root of their number",
+    ),
     "feature_every": Default(
         _feature_every, "training views: a tenth of their number, from 1 to 4"
     ),
@@ -118,7 +123,7 @@ DEFAULTS = {  # in this order: a later one may depend on an earlier
     ),
     "exposure": Default(
         _exposure,
-        f"photos: measured where they differ by {LEAST_SPREAD} stops from those about them",
+        f"photos: measured where they differ by {LEAST_SPREAD} stops",
     ),
     "lr_means": _by_steps(1.6e-4, 0.61),
     "lr_scales": _by_steps(5e-3, 0.52),
@@ -162,6 +167,11 @@ def decided(
     return {name: {"value": getattr(final, name), "by": by[name]} for name in names}
 
 
+def n_training_pixels(capture: Capture, points: Points) -> int:
+    """Pixels of the training photos, in all."""
+    return len(training_rows(capture, points)) * math.prod(capture.size)
+
+
 def evidence_of(
     train: TrainSection, capture: Capture, points: Points, features: Features | None
 ) -> Evidence:
@@ -185,7 +195,7 @@ def evidence_of(
         )
     return Evidence(
         n_views=n_views,
-        n_pixels=n_views * capture.size[0] * capture.size[1],
+        n_pixels=n_training_pixels(capture, points),
         points_measured=points.notes.get("how") == "depth" or "n_from_depth" in points.notes,
         no_depth=_why_no_depth(capture, points) if train.weight_depth is None else "",
         labels=labels,

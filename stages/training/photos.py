@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
-from chebsplat.photos.exposures import measured_exposures, own_part
+from chebsplat.photos.exposures import expected_exposures, measured_exposures
 from chebsplat.stages.training.views import training_rows
 
 
-def own_exposures(capture: Capture, points: Points) -> tuple[np.ndarray, dict[str, Any]]:
-    """Difference of each training photo's exposure [V, 3] from its neighbours', in stops; and the
-    spread of `all` and of these `own` parts, None where no exposure is known. A second or two.
+@dataclass(frozen=True)
+class Exposures:
+    """Exposures in stops by channel. of_photos [T, 3]: of the training photos; of_views [V, 3]:
+    expected of any photo from the points' views, by where these are; spread: standard deviation of
+    what was measured, None where nothing could be.
     """
-    measured, poses = exposures_of(capture, points)
-    finite = measured[np.isfinite(measured).all(1)]
-    own = own_part(measured, poses)
-    return own, {
-        "all": float(finite.std(0).mean()) if len(finite) else None,
-        "own": float(own.std(0).mean()),
-    }
+
+    of_photos: np.ndarray
+    of_views: np.ndarray
+    spread: float | None
 
 
-def exposures_of(capture: Capture, points: Points) -> tuple[np.ndarray, np.ndarray]:
-    """Exposures of the training views in stops, by the points' tracks, if any; and their poses."""
+def exposures_of(capture: Capture, points: Points) -> Exposures:
+    """Exposures of a scene's photos, by what they show of the same points. A second or two.
+
+    Choices: a photo that shows too few points has the exposure that is expected of it.
+    """
     row = {name: view for view, name in enumerate(capture.names)}
     used = training_rows(capture, points)
     tracks = None
@@ -37,4 +39,8 @@ def exposures_of(capture: Capture, points: Points) -> tuple[np.ndarray, np.ndarr
         tracks = tracks[tracks[:, 1] >= 0]
     photos = (capture.images[row[points.names[k]]] for k in used)
     poses = points.cam_from_world[used]
-    return measured_exposures(photos, points.Ks[used], poses, points.means, tracks), poses
+    measured = measured_exposures(photos, points.Ks[used], poses, points.means, tracks)
+    expected = expected_exposures(measured, poses, points.cam_from_world)
+    known = np.isfinite(measured)
+    spread = float(measured[known.all(1)].std(0).mean()) if known.any() else None
+    return Exposures(np.where(known, measured, expected[used]), expected, spread)

@@ -17,6 +17,7 @@ from chebsplat.formats.capture import Capture
 from chebsplat.formats.evaluation import Evaluation
 from chebsplat.formats.features import Features
 from chebsplat.formats.scene import Scene
+from chebsplat.photos.exposures import relit
 from chebsplat.pipelines.planning.plan import Planner
 from chebsplat.pipelines.work import summary
 from chebsplat.render import SceneRenderer, frame_parts
@@ -181,6 +182,32 @@ def test_covisible_pixels_are_counted_among_those_of_known_depth_that_no_mask_hi
     assert covisible_of(wall_capture(loss_mask=mask))["share"] == 1.0
     mask[1] = False  # a training photo shows nothing where it is masked
     assert covisible_of(wall_capture(loss_mask=mask)) is None
+
+
+@pytest.mark.xdist_group("toy")
+def test_views_are_rendered_in_the_exposure_that_photos_from_there_are_expected_to_have(
+    toy, tmp_path
+):
+    """Test photos of other exposures, which the scene's cameras tell, cost next to nothing."""
+    capture, scene = Capture.read(toy["ingest"]), Scene.read(toy["export"])
+    n, tested = len(scene.cameras.names), np.flatnonzero(capture.is_test)
+    scene.cameras.exposures = np.linspace(-0.8, -0.4, 3 * n).reshape(n, 3)
+    stops = dict(zip(scene.cameras.names, scene.cameras.exposures, strict=True))
+    capture.images = capture.images[:].copy()
+    for view in tested:
+        capture.images[view] = relit(capture.images[view], stops[capture.names[view]])
+    inputs = inputs_of(toy, "evaluate") | {
+        "capture": published(tmp_path / "capture", capture),
+        "scene": published(tmp_path / "scene", scene),
+    }
+    assert run_stage("evaluate", tmp_path / "out", inputs) == 0
+    lit, plain = (Evaluation.read(path).figures for path in (tmp_path / "out", toy["evaluate"]))
+    for one, other in zip(*(of["image"]["per_view"]["psnr"] for of in (lit, plain)), strict=True):
+        assert other < one < other + 8  # darker photos have smaller differences
+    most = max(np.abs(stops[capture.names[view]]).max() for view in tested)
+    assert lit["image"]["exposure_stops"] == pytest.approx(most)
+    assert "exposure_stops" not in plain["image"]
+    assert artifact.read_manifest(tmp_path / "out").facts["layout_error"] == 0
 
 
 @pytest.mark.xdist_group("toy")

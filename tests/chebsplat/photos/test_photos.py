@@ -15,15 +15,15 @@ from chebsplat.evaluation.metrics import color_fitted
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.points import Points
 from chebsplat.photos import exposures as measuring
-from chebsplat.photos.exposures import measured_exposures, own_part, relit
+from chebsplat.photos.exposures import expected_exposures, measured_exposures, relit
 from chebsplat.settings import TrainSection
 from chebsplat.splats.planes import at_pixels
 from chebsplat.stages.ingest import displaced, recolored
 from chebsplat.stages.runtime import config
 from chebsplat.stages.runtime.command import Job
-from chebsplat.stages.training.assembly import Inputs, assemble
+from chebsplat.stages.training.assembly import Inputs, assemble, measure_exposures
 from chebsplat.stages.training.defaults import DEPTH_WEIGHT, evidence_of, resolved
-from chebsplat.stages.training.photos import own_exposures
+from chebsplat.stages.training.photos import exposures_of
 from chebsplat.stages.training.views import training_views
 from chebsplat.training.losses import depth_distance
 from chebsplat.views import reduced
@@ -78,41 +78,52 @@ def ring(n):
     return poses
 
 
-def test_exposures_that_drift_along_the_path_are_shared_and_those_of_single_photos_their_own():
+def test_exposures_that_drift_along_the_path_are_expected_between_and_those_of_single_photos_not():
     g, poses, angle = (
         np.random.default_rng(0),
         ring(40),
         np.linspace(0, 2 * np.pi, 40, endpoint=False)[:, None],
     )
     drift = 0.3 * np.sin(angle) * np.array([1, 0.9, 1.2])
-    assert np.abs(own_part(drift, poses)).max() < 0.01
+    some = np.arange(0, 40, 2)
+    assert np.abs(expected_exposures(drift[some], poses[some], poses) - drift).max() < 0.01
     noise = g.normal(size=(40, 1)) * 0.2 + g.normal(size=(40, 3)) * 0.02
-    own = own_part(drift + noise, poses)
-    assert (own - noise + noise.mean(0)).std() < 0.55 * noise.std()
-    alone = np.full((40, 3), np.nan)
-    assert (
-        not own_part(alone, poses).any()
-        and not own_part(np.zeros((40, 3)), np.tile(np.eye(4), (40, 1, 1))).any()
-    )
-    some = np.where(np.arange(40)[:, None] == 7, np.nan, drift + noise)
-    assert not own_part(some, poses)[7].any() and own_part(some, poses)[8].any()
+    off = expected_exposures(drift + noise, poses, poses) - drift - noise.mean(0)
+    assert off.std() < 0.55 * noise.std()
+    known = np.where(np.arange(40)[:, None] == 7, np.nan, drift)
+    assert np.abs(expected_exposures(known, poses, poses[7:8]) - drift[7]).max() < 0.02
+    assert expected_exposures(np.full((40, 3), 0.4), poses, poses[:5]) == pytest.approx(0.4)
+    known[2:] = np.nan
+    assert not expected_exposures(known, poses, poses).any()
 
 
-def test_own_exposures_of_many_views_are_told_of_every_second_one_by_itself(monkeypatch):
+def test_of_many_photos_every_second_one_tells_what_to_expect(monkeypatch):
     poses, values = ring(40), np.random.default_rng(0).normal(size=(40, 3))
-    own = own_part(values, poses)
+    expected = expected_exposures(values, poses, poses)
+    others = np.stack([values, values + 9], 1).reshape(80, 3)  # which do not count
     monkeypatch.setattr(measuring, "MOST_VIEWS", 40)
-    halves = own_part(np.repeat(values, 2, 0), np.repeat(poses, 2, 0))
-    assert np.allclose(halves[::2], own) and np.allclose(halves[1::2], own)
+    assert np.allclose(expected_exposures(others, np.repeat(poses, 2, 0), poses), expected)
 
 
-def test_an_exposure_that_no_neighbour_shares_is_undone_in_training():
-    """One photo of eight is half as bright, and is trained on as bright as the others."""
+def test_exposures_are_undone_in_training_and_expected_of_views_between():
+    """Photos along a path grow brighter: all are trained on alike, and what is expected of the test
+    views among them follows the path. One photo's own exposure is undone as well.
+    """
+    capture, points = photographed("colmap", 1.3 ** np.linspace(-1, 1, 9))
+    capture.is_test = np.isin(np.arange(9), (2, 6))
+    points.cam_from_world[:, 0, 3] = np.linspace(-0.2, 0.2, 9)
+    exposures = exposures_of(capture, points)
+    assert exposures.spread > 0.3
+    photos = training_views(capture, points, None, exposures=exposures.of_photos).images.float()
+    assert photos.mean((1, 2, 3)).std() < 3
+    steps = np.diff(exposures.of_views.mean(1))  # 1.3 ** .25 in sRGB, about 2.2 times in stops
+    assert steps == pytest.approx(2.2 * 0.25 * np.log2(1.3), abs=0.06)
     capture, points = photographed("colmap", [1, 1, 1, 0.5, 1, 1, 1, 1])
-    points.cam_from_world[:, 0, 3] = np.linspace(-0.2, 0.2, 8)
-    undone, _ = own_exposures(capture, points)
+    undone = exposures_of(capture, points).of_photos
     photos = training_views(capture, points, None, exposures=undone).images.float()
     assert photos.mean((1, 2, 3)).std() < 3 and capture.images[3].max() == 50
+    alone = exposures_of(*photographed("colmap", [1, 0.5]))  # too few to expect anything
+    assert not alone.of_views.any() and alone.of_photos.any()
 
 
 def test_depth_is_a_channel_that_changes_no_colour():
@@ -263,7 +274,8 @@ def test_exposures_are_undone_where_photos_of_the_same_points_differ(
 ):
     job = Job({}, config.build({"train": {"exposure": chosen}}, "test"), tmp_path, tmp_path)
     capture, points = photographed(kind, gains)
-    trainer = assemble(job, Inputs(capture, points))
+    exposures = measure_exposures(job, capture, points)
+    trainer = assemble(job, Inputs(capture, points, exposures=exposures))
     assert (trainer.settings.exposure == "measured") == wanted and why in job.facts.get(
         "left_out", {}
     ).get("exposure by photo", "")

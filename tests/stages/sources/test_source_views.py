@@ -418,12 +418,14 @@ def test_test_photos_are_held_as_they_were_taken_and_measured_so(tmp_path, max_s
     )
     undistorted = Image.fromarray(np.asarray(capture.images[0]))
     capture.taken = dict(enumerate(capture.taken))  # which gives one at a time alone
-    right = figures_as_taken(capture, pictures, views)
+    as_they_are = dict.fromkeys(views, np.zeros(3))
+    right = figures_as_taken(capture, pictures, views, as_they_are)
     assert right["size"] == [400, 300] and right["psnr"] > (30 if max_side > 400 else 20)
+    darker = dict.fromkeys(views, np.full(3, -0.3))
+    assert figures_as_taken(capture, pictures, views, darker)["psnr"] < right["psnr"] - 1
     capture.lenses[0][2][4] *= 1.2
-    assert figures_as_taken(capture, pictures, views)["psnr"] < right["psnr"] - (
-        3 if max_side > 400 else 1
-    )
+    wrong = figures_as_taken(capture, pictures, views, as_they_are)
+    assert wrong["psnr"] < right["psnr"] - (3 if max_side > 400 else 1)
 
 
 def test_the_size_of_photos_as_taken_is_one_that_they_have():
@@ -437,9 +439,9 @@ def test_the_size_of_photos_as_taken_is_one_that_they_have():
     grey = SimpleNamespace(
         render=lambda view: (np.full((view.height, view.width, 3), 90, np.uint8), None)
     )
-    found = figures_as_taken(capture, grey, views)
+    found = figures_as_taken(capture, grey, views, dict.fromkeys(views, np.zeros(3)))
     assert (found["size"], found["psnr"], found["ssim"]) == ([48, 32], 100, pytest.approx(1))
-    assert figures_as_taken(capture, grey, {}) is None
+    assert figures_as_taken(capture, grey, {}, {}) is None
 
 
 def test_pixels_where_a_distortion_folds_back_do_not_count(tmp_path):
