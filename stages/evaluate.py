@@ -35,6 +35,7 @@ from chebsplat.stages.measuring.image_quality import (
     frame_split,
     image_figures,
     load_lpips,
+    mean_psnr,
     timing,
 )
 from chebsplat.stages.runtime.command import Job
@@ -95,13 +96,15 @@ def run(job: Job) -> None:
     for _ in views:  # views that the protocol did not use
         pass
     job.facts["layout_error"] = layout_error(job, scene, cameras[0], stacks["renders"][0])
-    lit = zip(stacks["renders"], stops.values(), strict=True)
-    stacks["renders"] = [relit(image, more) for image, more in lit]
+    as_shown = stacks["renders"]
+    stacks["renders"] = [
+        relit(image, stops[name]) for image, name in zip(as_shown, names, strict=True)
+    ]
     pictures |= {name: np.stack(maps) for name, maps in stacks.items()}
     masks = None if capture.loss_mask is None else [capture.loss_mask[row[name]] for name in names]
     figures["image"] = image_figures(pictures["renders"], pictures["truth"], masks, lpips)
     if scene.cameras.exposures is not None:
-        figures["image"]["exposure_stops"] = float(np.abs(np.stack([*stops.values()])).max())
+        figures["image"]["psnr_as_shown"] = mean_psnr(np.stack(as_shown), pictures["truth"], masks)
     figures["n_gaussians"] = len(scene.parameters["means"])
     figures["bytes"] = scene.summary["bytes"]
     figures |= timings(job, renderer, cameras, scene.labels is not None)

@@ -247,11 +247,7 @@ def summary_rows(
     rows = [
         Figure(f"PSNR, dB (8-bit, mean over views{of})", image["psnr"], form="{:.2f}"),
         Figure("PSNR after a colour fit by view, dB", image.get("psnr_fit"), form="{:.2f}"),
-        Figure(
-            "most exposure expected of these photos, stops",
-            image.get("exposure_stops", ""),
-            form="{:.2f}",
-        ),
+        *shown_rows(image.get("psnr_as_shown")),
         *taken_rows(image.get("as_taken")),
         *covisible_rows(image.get("covisible")),
         Figure("SSIM (window 11, σ 1.5)", image["ssim"], form="{:.4f}"),
@@ -311,6 +307,13 @@ def summary_rows(
 def percent(share: float | None) -> float | None:
     """A share in hundredths; None where it was not measured."""
     return None if share is None else 100 * share
+
+
+def shown_rows(psnr: float | None) -> list[Figure]:
+    """PSNR without the exposures that are expected of photos; none where there are none."""
+    if psnr is None:
+        return []
+    return [Figure("PSNR as shown, all views in one exposure, dB", psnr, form="{:.2f}")]
 
 
 def taken_rows(figures: dict[str, Any] | None) -> list[Figure]:

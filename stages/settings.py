@@ -131,7 +131,7 @@ class PoseSection(Section):
 class SfmSection(Section):
     max_points: int | None = number(
         None,
-        "initial Gaussians, at most; default: nine tenths of those that a training may grow to",
+        "initial Gaussians, at most; default: nine tenths of the default of train.max_gaussians",
         16,
         2_000_000,
     )

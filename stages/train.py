@@ -53,13 +53,13 @@ def run(job: Job) -> None:
         for k, v in m.state_dict().items()
     }
     modules |= {KNOWLEDGE + name: basis.numpy() for name, basis in bases.items()}
-    undone = inputs.exposures if trainer.settings.exposure == "measured" else None
+    exposures = inputs.exposures if trainer.settings.exposure == "measured" else None
     cameras = Cameras(
         points.names,
         points.Ks,
         points.cam_from_world,
         *inputs.capture.size,
-        None if undone is None else undone.of_views,
+        None if exposures is None else exposures.expected,
     )
     notes: dict[str, Any] = {
         "left_out": job.facts.get("left_out", {}),

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from scipy.sparse import csr_array
 from scipy.spatial.distance import cdist
 
 from chebsplat.cameras import centers
@@ -20,8 +21,7 @@ MOST_POINTS, LEAST_POINTS = (
 MOST = 300_000  # sightings of points that are looked at, or about as many
 # linear light beyond which a sensor is not linear, or saturated
 DARK, BRIGHT = 0.005, 0.85
-# of medians by point and by view, in turns: more for what drifts along a path, which stays
-ROUNDS, SETTLED = 30, 1e-4
+ROUNDS, LEAST_RESIDUAL = 10, 0.01  # of least squares; stops
 MOST_VIEWS = 1000  # whose exposures tell what to expect of others
 # how far apart views share an exposure, in median distances and radians
 REACHES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
@@ -55,9 +55,11 @@ def measured_exposures(
     Args: images: u8 [H, W, 3] of V views; Ks [V, 3, 3] pixels; cam_from_world [V, 4, 4]; points [N,
       3]; tracks: int [T, 2] (point, view), or None: points are seen by all views that have them
       within their frame.
-    Choices: light is that of a point times its view's exposure. Both are medians, by turns, so that
-      walls in between and highlights count little. Of many points, some: with tracks as many as are
-      seen MOST times in all.
+    Choices: light is that of a point times its view's exposure. Logarithms of both are fitted at
+      once, with least absolute residuals, so that walls in between and highlights count little.
+      Medians by turns, of points and of views, stop long before: where each point is seen by few
+      neighbours, they find next to nothing of a drift along a path. Of many points, some: with
+      tracks as many as are seen MOST times in all.
     """
     n_views = len(Ks)
     n_points = (
@@ -93,15 +95,30 @@ def measured_exposures(
         view[usable],
         np.unique(point[usable], return_inverse=True)[1],
     )
-    of_views = np.zeros((n_views, 3))
-    for _ in range(ROUNDS):
-        before, of_points = of_views, _medians(light - of_views[view], point)
-        of_views = _medians(light - of_points[point], view, n_views)
-        of_views -= of_views[enough].mean(0)
-        if np.abs(of_views - before)[enough].max() < SETTLED:
-            break
-    exposures[enough] = of_views[enough]
+    view = np.unique(view, return_inverse=True)[1]
+    exposures[enough] = np.stack([_of_views(values, view, point) for values in light.T], 1)
     return exposures
+
+
+def _of_views(light: np.ndarray, view: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """e [V], of mean 0, of the e and a that make Σ |light − a[point] − e[view]| about least, for
+    sightings light [M], view [M] and point [M].
+
+    Choices: least squares, each weighted by one over its last residual, ROUNDS times. Points are
+      eliminated: what is solved has as many unknowns as there are views.
+    """
+    weights = np.ones(len(light))
+    for _ in range(ROUNDS):
+        seen = csr_array((weights, (point, view)))  # [P, V]
+        of_points = seen.sum(1)
+        mean = np.bincount(point, weights * light) / of_points
+        normal = np.diag(seen.sum(0)) - (seen.T @ (seen / of_points[:, None])).toarray()
+        right = np.bincount(view, weights * (light - mean[point]))
+        e: np.ndarray = np.linalg.lstsq(normal, right, rcond=None)[0]
+        e -= e.mean()
+        a = mean - seen @ e / of_points
+        weights = 1 / np.maximum(np.abs(light - a[point] - e[view]), LEAST_RESIDUAL)
+    return e
 
 
 def _light_at(
@@ -125,23 +142,11 @@ def _light_at(
     return means[usable], there
 
 
-def _medians(values: np.ndarray, group: np.ndarray, n_groups: int = 0) -> np.ndarray:
-    """Medians [G, 3] of values [M, 3] by group [M]; 0 of an empty one."""
-    counts = np.bincount(group, minlength=n_groups)
-    first, result = np.cumsum(counts) - counts, np.zeros((len(counts), values.shape[1]))
-    filled = counts > 0
-    low, high = (first + (counts - 1) // 2)[filled], (first + counts // 2)[filled]
-    for channel, column in enumerate(values.T):
-        ordered = column[np.lexsort((column, group))]
-        result[filled, channel] = (ordered[low] + ordered[high]) / 2
-    return result
-
-
 def expected_exposures(
     exposures: np.ndarray, cam_from_world: np.ndarray, at: np.ndarray
 ) -> np.ndarray:
     """Exposures [Q, 3] that photos from the poses `at` [Q, 4, 4] may be expected to have, by those
-    [V, 3] of photos from other poses; 0, the mean, where fewer than three are known.
+    [V, 3] of photos from `cam_from_world` [V, 4, 4]; 0, the mean, where fewer than three are known.
 
     Args:    exposures: NaN where unknown.
     Choices: exposures are a Gaussian process over camera centres, in median distances, and

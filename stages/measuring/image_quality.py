@@ -60,6 +60,14 @@ def image_figures(
     return {"lpips": None} | means | {"per_view": per_view}
 
 
+def mean_psnr(renders: np.ndarray, truth: np.ndarray, masks: list[np.ndarray] | None) -> float:
+    """Mean PSNR, dB, over views of 8-bit images; masked pixels do not count."""
+    if masks is None:
+        masks = [np.ones(image.shape[:2], bool) for image in truth]
+    views = zip(renders, truth, masks, strict=True)
+    return float(np.mean([min(psnr(a[counted], b[counted]), 100.0) for a, b, counted in views]))
+
+
 def covisible_figures(
     capture: Capture, cameras: Cameras, names: Sequence[str], renders: np.ndarray
 ) -> dict[str, float] | None:

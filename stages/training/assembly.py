@@ -90,9 +90,10 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
     torch.set_num_threads(1 if train.method == "ours" else n_threads())
     model = model_of(points, features, train, job.config.describe, job.device, backend, capture)
     undone = None
-    if train.exposure == "measured" and inputs.exposures is not None:
-        undone = inputs.exposures.of_photos
-        log.info("exposures of photos differ by %.2f stops: undone", spread or 0.0)
+    if train.exposure == "measured":
+        assert inputs.exposures is not None
+        undone = inputs.exposures.measured
+        log.info("exposures of photos differ by %.2f stops: undone", spread)
     views = training_views(capture, points, features, bool(train.weight_depth), undone).to(
         job.device
     )
@@ -125,25 +126,26 @@ def knowledge_of(earlier: Path, model: PrintedScene) -> dict[str, Tensor]:
 
 def measure_exposures(job: Job, capture: Capture, points: Points) -> Exposures | None:
     """Exposures of the photos, whose spread becomes a fact; None where they are not needed."""
-    mode = job.config.train.exposure
-    if mode == "off" or (mode == "auto" and capture.source.get("kind") == "generated"):
+    train = job.config.train
+    generated = train.exposure == "auto" and capture.source.get("kind") == "generated"
+    if train.exposure == "off" or train.method == "printed" or generated:
         return None
     exposures = exposures_of(capture, points)
-    job.facts["exposure_stops"] = exposures.spread
+    job.facts["exposure_spread"] = exposures.spread
     return exposures
 
 
-def _why_no_exposure(train: TrainSection, stops: float | None) -> str:
-    """Reason for leaving photos' exposures as they are. stops: their spread; None: not measured."""
-    if stops is not None:
-        return f"photos differ by {stops:.2f} stops"
+def _why_no_exposure(train: TrainSection, spread: float | None) -> str:
+    """Reason for leaving photos' exposures as they are. spread: in stops; None: not measured."""
+    if spread is not None:
+        return f"photos differ by {spread:.2f} stops"
     return "train.exposure is off" if train.exposure == "off" else "views are generated, all alike"
 
 
 def _note_left_out(job: Job, train: TrainSection, has_semantics: bool, no_depth: str) -> None:
     """Note the parts that this training leaves out, and why. train: resolved."""
     requested = job.config.train
-    stops = job.facts.get("exposure_stops")
+    spread = job.facts.get("exposure_spread")
     if requested.method == "printed":
         for what in ("depth loss", "exposure by photo"):
             job.left_out(what, PRINTED_METHOD)
@@ -154,7 +156,7 @@ def _note_left_out(job: Job, train: TrainSection, has_semantics: bool, no_depth:
                 "train.weight_depth is 0" if requested.weight_depth is not None else no_depth,
             )
         if train.exposure == "off":
-            job.left_out("exposure by photo", _why_no_exposure(requested, stops))
+            job.left_out("exposure by photo", _why_no_exposure(requested, spread))
     if not has_semantics:
         job.left_out("semantic branch", "colours alone are trained: no teacher's features are read")
     if train.without != "nothing":

@@ -123,7 +123,7 @@ DEFAULTS = {  # in this order: a later one may depend on an earlier
     ),
     "exposure": Default(
         _exposure,
-        f"photos: measured where they differ by {LEAST_SPREAD} stops",
+        f"photos: measured where their exposures deviate by {LEAST_SPREAD} stops or more",
     ),
     "lr_means": _by_steps(1.6e-4, 0.61),
     "lr_scales": _by_steps(5e-3, 0.52),

@@ -14,14 +14,14 @@ from chebsplat.stages.training.views import training_rows
 
 @dataclass(frozen=True)
 class Exposures:
-    """Exposures in stops by channel. of_photos [T, 3]: of the training photos; of_views [V, 3]:
-    expected of any photo from the points' views, by where these are; spread: standard deviation of
-    what was measured, None where nothing could be.
+    """Exposures in stops by channel. measured [T, 3]: of the training photos; expected [V, 3]: of a
+    photo from each of the points' views, by where it is; spread: standard deviation of those that
+    could be measured, 0 of none.
     """
 
-    of_photos: np.ndarray
-    of_views: np.ndarray
-    spread: float | None
+    measured: np.ndarray
+    expected: np.ndarray
+    spread: float
 
 
 def exposures_of(capture: Capture, points: Points) -> Exposures:
@@ -42,5 +42,5 @@ def exposures_of(capture: Capture, points: Points) -> Exposures:
     measured = measured_exposures(photos, points.Ks[used], poses, points.means, tracks)
     expected = expected_exposures(measured, poses, points.cam_from_world)
     known = np.isfinite(measured)
-    spread = float(measured[known.all(1)].std(0).mean()) if known.any() else None
+    spread = float(measured[known.all(1)].std(0).mean()) if known.any() else 0.0
     return Exposures(np.where(known, measured, expected[used]), expected, spread)

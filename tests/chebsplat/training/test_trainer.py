@@ -4,6 +4,7 @@ import chebsplat  # noqa: F401  # isort: skip
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from thread_counts import assert_same_bits
 from benchmarks.stability.training import four_views, tiny_trainer
 from chebsplat.errors import DataFailure
 from chebsplat.settings import TrainSection
+from chebsplat.stages.sfm import default_points
 from chebsplat.stages.training.defaults import Evidence, resolved
 from chebsplat.training import schedule as schedules
 from chebsplat.training import sh_prune
@@ -329,6 +331,16 @@ def test_a_training_that_is_not_told_has_steps_by_the_pixels_of_its_photos():
     told = tiny_trainer(steps=1000, n_densify=0)
     found = [[group["rate"] for group in one.optimizer.param_groups] for one in (made, told)]
     assert found[0] == found[1]
+
+
+def test_gaussians_and_points_are_capped_by_the_pixels_of_the_training_photos():
+    found = [decided(n_views).max_gaussians for n_views in (1, 520, 2084, 8334)]
+    assert found == [40_000, 40_000, pytest.approx(80_000, rel=1e-3), pytest.approx(160_000, 1e-3)]
+    assert decided(5000, max_gaussians=70).max_gaussians == 70
+    is_test = np.arange(2605) % 5 == 0  # 2084 of them are trained on
+    points = default_points(SimpleNamespace(is_test=is_test, size=(320, 240)))
+    assert points == pytest.approx(0.9 * 80_000, rel=1e-3)
+    assert default_points(SimpleNamespace(is_test=is_test[:9], size=(320, 240))) == 36_000
 
 
 def test_rates_follow_the_number_of_steps_unless_they_are_given():
