@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from collections.abc import Iterable, Sequence
 from contextlib import redirect_stdout
@@ -78,7 +77,7 @@ def finished(runs: Iterable[tuple[str, str]], stage: str) -> list[Plan]:
     plans = [planner.plan(scene, settings) for scene, settings in runs]
     planner.save()
     with redirect_stdout(StringIO()):
-        code = execute(plans, stage, os.cpu_count() or 1)
+        code = execute(plans, stage, cores())
     if code:
         raise SystemExit(code)
     return plans
