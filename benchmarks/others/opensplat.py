@@ -30,6 +30,7 @@ from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.points import Points
 from chebsplat.formats.world import World
+from chebsplat.photos.exposures import relit
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.measuring.image_quality import image_figures
 from chebsplat.stages.tools.camera_files import write_capture
@@ -83,17 +84,19 @@ def train_opensplat(
     return last, int(last.stem.split("_")[1])
 
 
-def center(cameras: Cameras) -> Cameras:
-    """Cameras whose principal point is the middle of the image."""
+def as_opensplat_sees(cameras: Cameras) -> Cameras:
+    """Cameras whose principal point is the middle of the image, and whose photos have the exposures
+    that they were trained in.
+    """
     Ks = cameras.Ks.copy()
     Ks[:, 0, 2], Ks[:, 1, 2] = cameras.width / 2, cameras.height / 2
-    return replace(cameras, Ks=Ks)
+    return replace(cameras, Ks=Ks, exposures=None)
 
 
 def measure_test_views(
     capture: Capture, cameras: Cameras, parameters: dict[str, np.ndarray], shrunk: int = 1
 ) -> dict[str, Any]:
-    """PSNR and SSIM of the test views, which are among the cameras.
+    """PSNR and SSIM of the test views, which are among the cameras, in the exposures of these.
 
     Args: shrunk: views are blurred as much as photos are that many times smaller.
     """
@@ -103,7 +106,8 @@ def measure_test_views(
     renders = []
     for k in views:
         K, pose = (torch.from_numpy(m[k]).float() for m in (cameras.Ks, cameras.cam_from_world))
-        renders.append(renderer.render(View(K, pose, cameras.width, cameras.height))[0])
+        render = renderer.render(View(K, pose, cameras.width, cameras.height))[0]
+        renders.append(relit(render, cameras.stops(k)))
     rows = [row[cameras.names[k]] for k in views]
     masks = None if capture.loss_mask is None else [capture.loss_mask[k] for k in rows]
     figures = image_figures(np.stack(renders), np.stack([capture.images[k] for k in rows]), masks)
@@ -152,7 +156,7 @@ def main(arguments: Sequence[str]) -> int:
                 ply, steps = train_opensplat(options.binary, folder, out, options.seconds, steps)
                 parameters, degree, _ = read_ply(ply, World.read(capture.source))
                 parameters["degrees"] = np.full(len(parameters["means"]), degree, np.uint8)
-                cameras = center(gaussians.cameras)
+                cameras = as_opensplat_sees(gaussians.cameras)
                 measured = [
                     measure_test_views(capture, cameras, parameters, shrunk) for shrunk in (1, 2, 4)
                 ]
