@@ -80,7 +80,7 @@ def test_the_report_is_one_page_that_fetches_nothing(toy):
 
 def test_the_page_tells_what_the_scene_decided(toy):
     facts = read_manifest(toy["train"]).facts["decided"]
-    assert facts.keys() == DEFAULTS.keys() - {"steps"}  # which the config names
+    assert facts.keys() == DEFAULTS.keys() - {"steps", "max_gaussians"}  # which the config names
     page = (toy["report"] / "report.html").read_text()
     assert all(
         f"<code>train.{name}</code>" in page and decided["by"] in page
