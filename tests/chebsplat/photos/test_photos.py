@@ -78,6 +78,9 @@ def test_a_photo_relit_and_back_is_the_same_but_for_what_was_cut_off():
     assert np.abs(back.astype(int) - image).max() <= 1
     assert (relit(np.full((1, 1, 3), 250, np.uint8), np.ones(3)) == 255).all()
     assert np.array_equal(relit(image, np.zeros(3)), image)
+    grey = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, 2)
+    darker = relit(grey, np.full(3, -1.0))[0, :, 0].astype(int)
+    assert darker[255] == 255 and darker[220] < 170 and (np.diff(darker) >= 0).all()
 
 
 def ring(n):
