@@ -116,14 +116,16 @@ def _of_views(light: np.ndarray, view: np.ndarray, point: np.ndarray) -> np.ndar
     """
     weights = np.ones(len(light))
     for _ in range(ROUNDS):
-        seen = csr_array((weights, (point, view)))  # [P, V]
-        of_points = seen.sum(1)
+        sightings = csr_array((weights, (point, view)))  # [P, V]
+        of_points = sightings.sum(1)
         mean = np.bincount(point, weights * light) / of_points
-        normal = np.diag(seen.sum(0)) - (seen.T @ (seen / of_points[:, None])).toarray()
+        normal = (
+            np.diag(sightings.sum(0)) - (sightings.T @ (sightings / of_points[:, None])).toarray()
+        )
         right = np.bincount(view, weights * (light - mean[point]))
         e: np.ndarray = np.linalg.lstsq(normal, right, rcond=None)[0]
         e -= e.mean()
-        a = mean - seen @ e / of_points
+        a = mean - sightings @ e / of_points
         weights = 1 / np.maximum(np.abs(light - a[point] - e[view]), LEAST_RESIDUAL)
     return e
 
@@ -161,10 +163,10 @@ def expected_exposures(
       reach and the noise's share are those of the largest marginal likelihood, by brightness and by
       hue. Of more than MOST_VIEWS photos, every second counts, or every third.
     """
-    known = np.flatnonzero(np.isfinite(exposures).all(1))
-    if len(known) < 3:
+    finite = np.flatnonzero(np.isfinite(exposures).all(1))
+    if len(finite) < 3:
         return np.zeros((len(at), 3))
-    some = known[:: -(-len(known) // MOST_VIEWS)]
+    some = finite[:: -(-len(finite) // MOST_VIEWS)]
     eyes = centers(cam_from_world[some])
     apart = cdist(eyes, eyes)
     unit = np.median(apart[apart > 0]) if apart.any() else 1.0

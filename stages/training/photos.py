@@ -41,6 +41,6 @@ def exposures_of(capture: Capture, points: Points) -> Exposures:
     poses = points.cam_from_world[used]
     measured = measured_exposures(photos, points.Ks[used], poses, points.means, tracks)
     expected = expected_exposures(measured, poses, points.cam_from_world)
-    known = np.isfinite(measured)
-    spread = float(measured[known.all(1)].std(0).mean()) if known.any() else 0.0
-    return Exposures(np.where(known, measured, expected[used]), expected, spread)
+    finite = np.isfinite(measured)
+    spread = float(measured[finite.all(1)].std(0).mean()) if finite.any() else 0.0
+    return Exposures(np.where(finite, measured, expected[used]), expected, spread)
