@@ -17,6 +17,7 @@ from chebsplat.kernels.dispatch import one_torch_thread
 from chebsplat.rasterize import binning, ellipses, rasterize, tiles
 from chebsplat.rasterize.cuda import made_harmless
 from chebsplat.rasterize.depths import depths
+from chebsplat.splats.exposure import exposed
 from chebsplat.splats.gaussians import activated, surface_of, take
 from chebsplat.splats.planes import inverse_depths
 from chebsplat.splats.sh import eval_sh
@@ -78,9 +79,11 @@ class SceneRenderer:
     @torch.no_grad()
     @one_torch_thread()
     def render(
-        self, view: View, with_features: bool = False
+        self, view: View, with_features: bool = False, stops: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Image u8 [H, W, 3], and features f32 [H, W, C] where asked for and present."""
+        """Image u8 [H, W, 3], after so many more stops [3], and features f32 [H, W, C] where asked
+        for and present.
+        """
         finer = 1.0 if self.finest == math.inf else max(float(focals(view.K)) / self.finest, 1.0)
         view = view.to(self.means.device)
         # nothing waits for their number
@@ -96,7 +99,10 @@ class SceneRenderer:
         if self.on_gpu:  # an option of this backend alone
             options["harmless"] = True
         render, _, _ = rasterize(*gaussians, channels, *camera, **options)
-        image = (render[0, ..., :3].clamp(0, 1) * 255).round().byte().cpu().numpy()
+        rgb = render[0, ..., :3]
+        if stops is not None:
+            rgb = exposed(rgb, torch.from_numpy(stops).to(rgb))
+        image = (rgb.clamp(0, 1) * 255).round().byte().cpu().numpy()
         return image, render[0, ..., 3:].cpu().numpy() if channels.shape[1] > 3 else None
 
     @torch.no_grad()

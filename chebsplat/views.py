@@ -123,7 +123,8 @@ class Views:
     """Training views. images [V, H, W, 3] u8; masks [V, H, W] bool or None, both as tensors or
     stored; features: view index -> [h, w, C]; labels: view index -> `TaughtLabels` of these h × w
     cells, None where the teacher has none; depth: view index and factor -> z-depths [H, W] at
-    1/factor, scene units, nan where unknown.
+    1/factor, scene units, nan where unknown; exposures: [V, 3] stops that photos have more than a
+    picture of the scene, or None: all have none.
     """
 
     names: list[str]
@@ -134,6 +135,7 @@ class Views:
     features: Callable[[int], Tensor] | None = None
     labels: Callable[[int], TaughtLabels] | None = None
     depth: Callable[[int, int], Tensor] | None = None
+    exposures: Tensor | None = None
     scaled_Ks: dict[int, Tensor] = field(default_factory=dict)  # by factor, on first use
 
     def to(self, device: str | torch.device) -> Views:
@@ -167,6 +169,7 @@ class Views:
             at_hand["features"],
             None if labels is None else labels_there,
             at_hand["depth"],
+            None if self.exposures is None else self.exposures.to(device),
         )
 
     def camera(self, index: int, factor: int, window: Window | None = None) -> View:

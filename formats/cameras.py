@@ -27,9 +27,9 @@ class Cameras(Record):
     height: int
     exposures: Annotated[np.ndarray | None, Array("float64", ("view", 3), "stops")] = None
 
-    def stops(self, index: int) -> np.ndarray:
-        """Exposure [3] that a photo from a view is expected to have."""
-        return np.zeros(3) if self.exposures is None else self.exposures[index]
+    def stops(self, index: int) -> np.ndarray | None:
+        """Exposure [3] that a photo from a view is expected to have; None: the scene's."""
+        return None if self.exposures is None else self.exposures[index]
 
 
 def check_cameras(

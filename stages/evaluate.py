@@ -27,7 +27,6 @@ from chebsplat.formats.scene import Scene
 from chebsplat.formats.world import World
 from chebsplat.labels.decode import decode_labels
 from chebsplat.labels.names import lacking
-from chebsplat.photos.exposures import relit
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.measuring.image_quality import (
     covisible_figures,
@@ -97,9 +96,11 @@ def run(job: Job) -> None:
         pass
     job.facts["layout_error"] = layout_error(job, scene, cameras[0], stacks["renders"][0])
     as_shown = stacks["renders"]
-    stacks["renders"] = [
-        relit(image, stops[name]) for image, name in zip(as_shown, names, strict=True)
-    ]
+    if scene.cameras.exposures is not None:
+        stacks["renders"] = [
+            renderer.render(view, stops=stops[name])[0]
+            for name, view in zip(names, cameras, strict=True)
+        ]
     pictures |= {name: np.stack(maps) for name, maps in stacks.items()}
     masks = None if capture.loss_mask is None else [capture.loss_mask[row[name]] for name in names]
     figures["image"] = image_figures(pictures["renders"], pictures["truth"], masks, lpips)

@@ -30,7 +30,6 @@ from chebsplat.formats.gaussians import Gaussians
 from chebsplat.formats.ply import read_ply
 from chebsplat.formats.points import Points
 from chebsplat.formats.world import World
-from chebsplat.photos.exposures import relit
 from chebsplat.render import SceneRenderer
 from chebsplat.stages.measuring.image_quality import image_figures
 from chebsplat.stages.tools.camera_files import write_capture
@@ -106,8 +105,8 @@ def measure_test_views(
     renders = []
     for k in views:
         K, pose = (torch.from_numpy(m[k]).float() for m in (cameras.Ks, cameras.cam_from_world))
-        render = renderer.render(View(K, pose, cameras.width, cameras.height))[0]
-        renders.append(relit(render, cameras.stops(k)))
+        view = View(K, pose, cameras.width, cameras.height)
+        renders.append(renderer.render(view, stops=cameras.stops(k))[0])
     rows = [row[cameras.names[k]] for k in views]
     masks = None if capture.loss_mask is None else [capture.loss_mask[k] for k in rows]
     figures = image_figures(np.stack(renders), np.stack([capture.images[k] for k in rows]), masks)

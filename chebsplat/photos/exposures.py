@@ -21,7 +21,6 @@ MOST_POINTS, LEAST_POINTS = (
 MOST = 300_000  # sightings of points that are looked at, or about as many
 # linear light beyond which a sensor is not linear, or saturated
 DARK, BRIGHT = 0.005, 0.85
-WHITENS = 235  # of 255
 ROUNDS, LEAST_RESIDUAL = 10, 0.01  # of least squares; stops
 MOST_VIEWS = 1000  # whose exposures tell what to expect of others
 # how far apart views share an exposure, in median distances and radians
@@ -37,16 +36,10 @@ def light_of(values: np.ndarray) -> np.ndarray:
 
 
 def relit(image: np.ndarray, stops: np.ndarray) -> np.ndarray:
-    """An image u8 [H, W, 3] after so many more stops [3]; what becomes too bright is cut off.
-
-    Choices: white stays white, since a sensor has cut it off and nobody knows how bright it was;
-      from WHITENS on, values go over to that.
-    """
-    values = np.arange(256)[:, None]
-    lit = np.minimum(light_of(values / 255) * 2.0 ** np.asarray(stops), 1)
+    """An image u8 [H, W, 3] after so many more stops [3]; what becomes too bright is cut off."""
+    lit = np.minimum(light_of(np.arange(256)[:, None] / 255) * 2.0 ** np.asarray(stops), 1)
     tables = 255 * np.where(lit <= 0.0031308, 12.92 * lit, 1.055 * lit ** (1 / 2.4) - 0.055)
-    cut_off = ((values - WHITENS) / (255 - WHITENS)).clip(0, 1)
-    tables = (tables + cut_off * (values - tables).clip(0)).round().astype(np.uint8)
+    tables = tables.round().astype(np.uint8)
     return np.stack([tables[image[..., channel], channel] for channel in range(3)], -1)
 
 

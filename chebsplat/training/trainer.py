@@ -20,6 +20,7 @@ from chebsplat.evaluation.metrics import psnr
 from chebsplat.printed.losses import auxiliary_losses
 from chebsplat.settings import TrainSection
 from chebsplat.shape.regions import regions_of
+from chebsplat.splats.exposure import exposed, with_open_white
 from chebsplat.splats.planes import at_pixels
 from chebsplat.training import sh_prune
 from chebsplat.training.losses import depth_distance, photometric, semantic_loss
@@ -261,6 +262,7 @@ class Trainer:
             "class_codes": labels and labels.class_codes, "soft_mask": auxiliary.soft_mask,
             "band_masks": auxiliary.band_masks, "in_view": auxiliary.in_view,
             "delta": auxiliary.delta, "knowledge": auxiliary.knowledge,
+            "stops": None if self.views.exposures is None else self.views.exposures[index],
         }  # fmt: skip
         inputs = {name: value for name, value in optional.items() if value is not None}
         key = factor, tuple(inputs), labels is not None and labels.complete
@@ -278,7 +280,11 @@ class Trainer:
             dict(zip(names, tensors, strict=True)),
         )
         target, mask = reduced(inputs["photo"], inputs.get("mask"), factor)
-        losses = {"color": photometric(inputs["rgb"], target, mask, WEIGHT_SSIM, backend)}
+        rgb = inputs["rgb"]
+        if "stops" in inputs:
+            rgb = exposed(rgb, inputs["stops"])
+            target = with_open_white(target, rgb)
+        losses = {"color": photometric(rgb, target, mask, WEIGHT_SSIM, backend)}
         if "features" in inputs:
             labels = None
             if "classes" in inputs:
@@ -315,8 +321,10 @@ class Trainer:
         scores = []
         for index in indices:
             camera, degree = self.views.camera(index, 1), self.schedule.degree(self.share)
-            rendered = self.model.render(camera, degree, semantic=False)
-            image = (rendered.rgb.clamp(0, 1) * 255).round().byte().cpu().numpy()
+            rgb = self.model.render(camera, degree, semantic=False).rgb
+            if self.views.exposures is not None:
+                rgb = exposed(rgb, self.views.exposures[index])
+            image = (rgb.clamp(0, 1) * 255).round().byte().cpu().numpy()
             mask = None if self.views.masks is None else self.views.masks[index].cpu().numpy()
             truth = self.views.images[index].cpu().numpy()
             if mask is None or mask.any():

@@ -24,7 +24,6 @@ from chebsplat.formats.cameras import Cameras
 from chebsplat.formats.capture import Capture
 from chebsplat.kernels.threads import n_threads
 from chebsplat.labels.agreement import project, unhidden
-from chebsplat.photos.exposures import relit
 from chebsplat.render import PARTS, SceneRenderer, focals, frame_parts
 from chebsplat.training.losses import ssim
 from chebsplat.views import View
@@ -120,7 +119,7 @@ def figures_as_taken(
     capture: Capture,
     renderer: SceneRenderer,
     cameras: dict[str, View],
-    stops: dict[str, np.ndarray],
+    stops: dict[str, np.ndarray | None],
 ) -> dict[str, Any] | None:
     """PSNR, dB, and SSIM on the test photos as they were taken, of up to 1600 pixels a side, and
     `size`, width and height of most of them; None where none was undistorted or reduced.
@@ -144,7 +143,7 @@ def figures_as_taken(
         truth = np.ascontiguousarray(capture.taken[k][:height, :width])
         finer = lens.mean_focal_length() / float(focals(cameras[name].K))
         view = enlarged(cameras[name], finer)
-        K, render = view.K.double().numpy(), relit(renderer.render(view)[0], stops[name])
+        K, render = view.K.double().numpy(), renderer.render(view, stops=stops[name])[0]
         pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(
             -1, 2
         )

@@ -89,12 +89,12 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
     # short, and its threads wait for each other every time: for long on a shared machine.
     torch.set_num_threads(1 if train.method == "ours" else n_threads())
     model = model_of(points, features, train, job.config.describe, job.device, backend, capture)
-    undone = None
+    measured = None
     if train.exposure == "measured":
         assert inputs.exposures is not None
-        undone = inputs.exposures.measured
+        measured = inputs.exposures.measured
         log.info("exposures of photos differ by %.2f stops: undone", spread)
-    views = training_views(capture, points, features, bool(train.weight_depth), undone).to(
+    views = training_views(capture, points, features, bool(train.weight_depth), measured).to(
         job.device
     )
     if features is not None and train.feature_start == "lifted":

@@ -13,7 +13,6 @@ from chebsplat.errors import ConfigError, DataFailure, InputError
 from chebsplat.formats.capture import Capture
 from chebsplat.formats.features import Features
 from chebsplat.formats.points import Points
-from chebsplat.photos.exposures import relit
 from chebsplat.views import TaughtLabels, Views, remembered, stacked
 
 # of features that are cached in memory; others are read when their view is used
@@ -48,7 +47,7 @@ def training_views(
     with_depth: bool = False,
     exposures: np.ndarray | None = None,
 ) -> Views:
-    """The registered training views, joined by name, with exposures [V, 3], in stops, undone.
+    """The registered training views, joined by name, whose photos have exposures [V, 3], in stops.
 
     Raises: InputError if artifacts do not belong together, DataFailure without a training view.
     """
@@ -76,14 +75,10 @@ def training_views(
         if features.pseudo_labels is not None and features.confidence is not None:
             labels_of = taught_labels(features, [source[name] for name in names])
 
-    def photo(k: int) -> torch.Tensor:
-        image = images[rows[k]]
-        return torch.from_numpy(image if exposures is None else relit(image, -exposures[k]))
-
     depth_of = measured_depth(capture, points, used) if with_depth else None
     return Views(
         names,
-        stacked(photo, len(rows), PHOTO_BYTES),
+        stacked(lambda k: torch.from_numpy(images[rows[k]]), len(rows), PHOTO_BYTES),
         torch.from_numpy(points.Ks[used]).float(),
         torch.from_numpy(points.cam_from_world[used]).float(),
         None
@@ -92,6 +87,7 @@ def training_views(
         of,
         labels_of,
         depth_of,
+        None if exposures is None else torch.from_numpy(exposures).float(),
     )
 
 

@@ -207,7 +207,8 @@ def test_views_are_rendered_in_the_exposure_that_photos_from_there_are_expected_
         Evaluation.read(path).pictures["renders"] for path in (tmp_path / "out", toy["evaluate"])
     )
     for render, before, name in zip(renders, plain_renders, lit["names"], strict=True):
-        np.testing.assert_array_equal(render, relit(before, stops[name]))
+        off = render.astype(int) - relit(before, stops[name])
+        assert np.abs(off[before < 255]).max() <= 1
     assert lit["image"]["psnr"] > plain["image"]["psnr"]  # darker: differences are smaller
     assert lit["image"]["psnr_as_shown"] < plain["image"]["psnr"] - 5
     assert "psnr_as_shown" not in plain["image"]

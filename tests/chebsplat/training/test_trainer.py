@@ -15,6 +15,7 @@ from thread_counts import assert_same_bits
 from benchmarks.stability.training import four_views, tiny_trainer
 from chebsplat.errors import DataFailure
 from chebsplat.settings import TrainSection
+from chebsplat.splats.exposure import exposed
 from chebsplat.stages.sfm import default_points
 from chebsplat.stages.training.defaults import Evidence, resolved
 from chebsplat.training import schedule as schedules
@@ -406,6 +407,24 @@ def test_a_window_shows_its_part_of_the_picture():
     )  # large Gaussians beyond the border
     photo, _ = made.views.photo(1, window)
     assert torch.equal(photo, made.views.images[1][3:14, 5:22])
+
+
+def test_a_photo_of_another_exposure_is_compared_in_it():
+    """Photo 1 is what the model shows after a stop more light, cut off at white; photo 0, of the
+    same exposure, is not.
+    """
+    made = tiny_trainer(steps=4, densify="off")
+    with torch.no_grad():
+        made.model.raw["sh0"] += 2
+        shown = made.model.render(made.views.camera(1, 1), 0).rgb
+        brighter = (exposed(shown, torch.ones(3)).clamp(0, 1) * 255).round().byte()
+    assert (brighter == 255).any()
+    made.views.images[1] = brighter
+    alone = float(made.losses_of(1, 0.2)[1]["loss_color"])
+    made.views.exposures = torch.ones(len(made.views.names), 3)
+    together = [float(made.losses_of(view, 0.2)[1]["loss_color"]) for view in (0, 1)]
+    assert together[1] < 0.005 < 0.03 < min(together[0], alone)
+    assert made.held_in_psnr([1]) > 45 > made.held_in_psnr([0])
 
 
 def test_a_training_ends_in_the_same_bits_on_any_number_of_threads():
