@@ -163,8 +163,8 @@ class TrainSection(Section):
     sh_degree: int = number(3, "of colour, at most", 0, 3)
     max_gaussians: int | None = number(
         None,
-        "growing stops here; more initial points are thinned; default: 40,000, more above 40 "
-        "million pixels of photos",
+        "growing stops here; more initial points are thinned; default: 40,000 with measured "
+        "depth, otherwise 100,000, more above 40 million pixels of photos",
         16,
         5_000_000,
     )

@@ -335,8 +335,13 @@ def test_a_training_that_is_not_told_has_steps_by_the_pixels_of_its_photos():
 
 
 def test_gaussians_and_points_are_capped_by_the_pixels_of_the_training_photos():
-    found = [decided(n_views).max_gaussians for n_views in (1, 520, 2084, 8334)]
-    assert found == [40_000, 40_000, pytest.approx(80_000, rel=1e-3), pytest.approx(160_000, 1e-3)]
+    views = np.array([1, 520, 2084, 8334])
+    for measured, least in ((True, 40_000), (False, 100_000)):
+        found = [
+            resolved(TrainSection(), Evidence(n, n * 320 * 240, measured)).max_gaussians
+            for n in views.tolist()
+        ]
+        assert found == pytest.approx(least * np.array([1, 1, 2, 4]), rel=1e-3)
     assert decided(5000, max_gaussians=70).max_gaussians == 70
     is_test = np.arange(2605) % 5 == 0  # 2084 of them are trained on
     points = default_points(SimpleNamespace(is_test=is_test, size=(320, 240)))
