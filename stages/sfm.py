@@ -27,7 +27,7 @@ log = logging.getLogger("chebsplat")
 # the fields of `Points` but the local shape, and seen_from [N]: the view that a point is from
 Cloud = dict[str, Any]
 N_NEIGHBORS = 16  # that give a point its normal and covariance
-POINTS_SHARE = 0.9  # of the Gaussians that a training may grow to
+POINTS_SHARE = 0.9  # of the Gaussians that a training of measured points may grow to
 CANDIDATES = 16  # pixels with depth that are drawn for each point at most
 TRIED = 2000  # points that are compared with depth
 EVEN = 0.55  # of the points: spaced evenly whatever the colours, for shape
@@ -94,9 +94,12 @@ def run(job: Job) -> None:
 
 
 def default_points(capture: Capture) -> int:
-    """Points of a scene, at most, by the pixels of its training photos."""
+    """Points of a scene, at most, by the pixels of its training photos.
+
+    Choices: with matched points as with measured ones, whose Gaussians may be fewer.
+    """
     n_pixels = int((~capture.is_test).sum()) * math.prod(capture.size)
-    return round(POINTS_SHARE * default_gaussians(n_pixels))
+    return round(POINTS_SHARE * default_gaussians(n_pixels, measured=True))
 
 
 def with_sides(job: Job, capture: Capture, cloud: Cloud, in_unit: bool) -> Cloud:

@@ -84,9 +84,7 @@ def train_opensplat(
 
 
 def as_opensplat_sees(cameras: Cameras) -> Cameras:
-    """Cameras whose principal point is the middle of the image, and whose photos have the exposures
-    that they were trained in.
-    """
+    """Cameras whose principal point is the middle of the image; photos are compared as rendered."""
     Ks = cameras.Ks.copy()
     Ks[:, 0, 2], Ks[:, 1, 2] = cameras.width / 2, cameras.height / 2
     return replace(cameras, Ks=Ks, exposures=None)
@@ -95,7 +93,7 @@ def as_opensplat_sees(cameras: Cameras) -> Cameras:
 def measure_test_views(
     capture: Capture, cameras: Cameras, parameters: dict[str, np.ndarray], shrunk: int = 1
 ) -> dict[str, Any]:
-    """PSNR and SSIM of the test views, which are among the cameras, in the exposures of these.
+    """PSNR and SSIM of the test views, which are among the cameras, in their exposures, if any.
 
     Args: shrunk: views are blurred as much as photos are that many times smaller.
     """

@@ -92,8 +92,8 @@ def photometric(
 ) -> Tensor:
     """(1 − w) L1 + w (1 − SSIM) over the pixels that count.
 
-    Args: render, target [H, W, 3] in [0, 1]; mask [H, W] bool, true where a pixel counts, or float
-      ≥ 0, how much it does; None: all alike; backend: of `rasterize`.
+    Args: render [H, W, 3] of 0 and more, target in [0, 1]; mask [H, W] bool, true where a pixel
+      counts, or float ≥ 0, how much it does; None: all alike; backend: of `rasterize`.
     Choices: pixels that do not count take the target's colour first, so they have no gradient, not
       even through SSIM's window. 0 where nothing counts.
     """

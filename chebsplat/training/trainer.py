@@ -20,7 +20,7 @@ from chebsplat.evaluation.metrics import psnr
 from chebsplat.printed.losses import auxiliary_losses
 from chebsplat.settings import TrainSection
 from chebsplat.shape.regions import regions_of
-from chebsplat.splats.exposure import exposed, with_open_white
+from chebsplat.splats.exposure import cut_off, exposed
 from chebsplat.splats.planes import at_pixels
 from chebsplat.training import sh_prune
 from chebsplat.training.losses import depth_distance, photometric, semantic_loss
@@ -282,8 +282,7 @@ class Trainer:
         target, mask = reduced(inputs["photo"], inputs.get("mask"), factor)
         rgb = inputs["rgb"]
         if "stops" in inputs:
-            rgb = exposed(rgb, inputs["stops"])
-            target = with_open_white(target, rgb)
+            rgb = cut_off(exposed(rgb, inputs["stops"]), target)
         losses = {"color": photometric(rgb, target, mask, WEIGHT_SSIM, backend)}
         if "features" in inputs:
             labels = None

@@ -44,7 +44,8 @@ class SceneFacts:
     kind: of its source. raw, posed, trained: megapixels of all photos as they were taken, and as
     `pose` and `ingest` reduce them; compared: of one as `evaluate` does. pairs: of photos that
     `pose` matches. steps, clock: of the training, clock: s, None: as long as the steps take.
-    gaussians: at most. model: a 2D teacher's model is run.
+    gaussians: at most, of points of measured depth; others take up to 1.5 times the training.
+    model: a 2D teacher's model is run.
     """
 
     kind: str
@@ -124,7 +125,7 @@ def facts_of(
             n * (n - 1) // 2 if all_pairs else round(0.6 * pose.get("n_matched", 10) * n),
             train.get("steps") or default_steps(n_training_pixels),
             train.get("seconds"),
-            train.get("max_gaussians") or default_gaussians(n_training_pixels),
+            train.get("max_gaussians") or default_gaussians(n_training_pixels, measured=True),
             train.get("method") == "printed",
             semantic,
             teacher.get("model") is not None,

@@ -31,6 +31,7 @@ from chebsplat.stages.training.defaults import (
     OPEN,
     decided,
     evidence_of,
+    from_measured_depth,
     n_training_pixels,
     resolved,
 )
@@ -93,7 +94,7 @@ def assemble(job: Job, inputs: Inputs, backend: str = "auto") -> Trainer:
     if train.exposure == "measured":
         assert inputs.exposures is not None
         measured = inputs.exposures.measured
-        log.info("exposures of photos differ by %.2f stops: undone", spread)
+        log.info("exposures of photos differ by %.2f stops: renders take them", spread)
     views = training_views(capture, points, features, bool(train.weight_depth), measured).to(
         job.device
     )
@@ -261,7 +262,8 @@ def read_start(
 def within_cap(job: Job, capture: Capture, points: Points) -> Points:
     """The points that a training starts from: all, or `max_gaussians` of them."""
     n, most = len(points.means), job.config.train.max_gaussians
-    most = most or default_gaussians(n_training_pixels(capture, points))
+    measured = from_measured_depth(points)
+    most = most or default_gaussians(n_training_pixels(capture, points), measured)
     if n > most:
         job.left_out(f"{n - most} of {n} initial points", f"train.max_gaussians is {most}")
     return thinned(points, most, job.config.train.seed)

@@ -20,8 +20,7 @@ TRAVEL, FASTEST = 10.0, 5e-2  # a features' rate: less than TRAVEL over all step
 DEPTH_WEIGHT = 0.8
 MOST_APART = 0.003  # of a point's depth, within which views agree on it
 LIFTED_FROM = 40  # views
-GROWTH = 2.5  # times as many Gaussians at most, if initial points lie on no measured surfaces
-LEAST_SPREAD = 0.05  # stops between the photos' exposures, from which on these are undone
+LEAST_SPREAD = 0.05  # stops between the photos' exposures, from which on they are measured
 
 
 @dataclass(frozen=True)
@@ -50,16 +49,6 @@ class Default:
 
     value: Callable[[TrainSection, Evidence], Any]
     by: str
-
-
-def _max_gaussians(_: TrainSection, evidence: Evidence) -> int:
-    """More where points come from matches: they are few, and growth alone fills in texture.
-
-    fox gains .7 dB by 100,000 at the same pace, and plushbed nothing. office0, whose depth gives it
-    36,000 points, would gain .4 dB by 92,000 Gaussians in the place of 38,000.
-    """
-    most = default_gaussians(evidence.n_pixels)
-    return most if evidence.points_measured else round(GROWTH * most)
 
 
 def _feature_every(_: TrainSection, evidence: Evidence) -> int:
@@ -111,9 +100,9 @@ DEFAULTS = {  # in this order: a later one may depend on an earlier
         "pixels of the training photos: 280 a megapixel, from 1000 to 3000",
     ),
     "max_gaussians": Default(
-        _max_gaussians,
-        "initial points: 40,000 where depth is measured, otherwise 100,000, and above 40 million "
-        "pixels of training photos more by the root of their number",
+        lambda _, evidence: default_gaussians(evidence.n_pixels, evidence.points_measured),
+        "initial points: 40,000 if from measured depth, otherwise 100,000; above 40 million pixels "
+        "of training photos more, by the root of their number",
     ),
     "feature_every": Default(
         _feature_every, "training views: a tenth of their number, from 1 to 4"
@@ -179,6 +168,11 @@ def decided(
     return {name: {"value": getattr(final, name), "by": by[name]} for name in names}
 
 
+def from_measured_depth(points: Points) -> bool:
+    """True if points lie on measured surfaces."""
+    return points.notes.get("how") == "depth" or "n_from_depth" in points.notes
+
+
 def n_training_pixels(capture: Capture, points: Points) -> int:
     """Pixels of the training photos, in all."""
     return len(training_rows(capture, points)) * math.prod(capture.size)
@@ -208,7 +202,7 @@ def evidence_of(
     return Evidence(
         n_views=n_views,
         n_pixels=n_training_pixels(capture, points),
-        points_measured=points.notes.get("how") == "depth" or "n_from_depth" in points.notes,
+        points_measured=from_measured_depth(points),
         no_depth=_why_no_depth(capture, points) if train.weight_depth is None else "",
         labels=labels,
     )

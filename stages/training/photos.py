@@ -1,4 +1,4 @@
-"""Exposures of the training photos, which a training can undo."""
+"""Exposures of the training photos, in which a training compares renders with them."""
 
 from __future__ import annotations
 

@@ -47,7 +47,8 @@ def training_views(
     with_depth: bool = False,
     exposures: np.ndarray | None = None,
 ) -> Views:
-    """The registered training views, joined by name, whose photos have exposures [V, 3], in stops.
+    """The registered training views, joined by name, T of them. exposures: of their photos [T, 3],
+    stops.
 
     Raises: InputError if artifacts do not belong together, DataFailure without a training view.
     """

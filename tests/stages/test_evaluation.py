@@ -226,7 +226,7 @@ def test_views_are_rendered_in_the_exposure_that_photos_from_there_are_expected_
 
 
 @pytest.mark.xdist_group("toy")
-def test_a_drift_of_exposures_is_undone_in_training_and_expected_of_test_photos(toy, tmp_path):
+def test_a_drift_of_exposures_is_measured_in_training_and_expected_of_test_photos(toy, tmp_path):
     """Photos are the brighter the further their camera stands along x."""
     capture, points = Capture.read(toy["ingest"]), Points.read(toy["sfm"])
     eyes = centers(capture.cam_from_world)[:, 0]

@@ -187,12 +187,17 @@ def test_a_step_that_cannot_be_recorded_is_launched_as_it_is(gpu, trainer_on, ca
     assert said.endswith("capturing")
 
 
-def test_a_training_on_the_simulated_gpu_is_the_one_in_plain_torch(gpu, trainer_on):
+@pytest.mark.parametrize("stops", [None, 0.3])
+def test_a_training_on_the_simulated_gpu_is_the_one_in_plain_torch(gpu, trainer_on, stops):
+    """Photos have one exposure, or each its own."""
+    exposures = None if stops is None else torch.linspace(-stops, stops, 300).reshape(100, 3)
     plain = trainer_on("cpu", densify="off")
+    plain.views.exposures = exposures
     for _ in plain.steps():
         pass
     with gpu.active():
         made = trainer_on("cuda", densify="off")
+        made.views.exposures = None if exposures is None else exposures.to("cuda")
         for _ in made.steps():
             pass
         found = made.held_in_psnr([0, 1, 2])

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from chebsplat.photos.exposures import relit
-from chebsplat.splats.exposure import exposed, with_open_white
+from chebsplat.splats.exposure import cut_off, exposed
 
 STOPS = torch.tensor([0.7, 0.0, -1.2])
 
@@ -29,9 +29,12 @@ def test_gradients_of_exposed_colors_are_those_of_differences():
 
 
 def test_white_of_a_photo_is_as_much_light_at_least():
-    photo, lit = (
+    """Up to 250 of 255 a photo is no white. What is cut off has no gradient."""
+    photo, colors = (
         torch.tensor(values)[:, None].repeat(1, 3)
-        for values in ([1.0, 1.0, 0.9, 0.9], [1.3, 0.8, 1.3, 0.2])
+        for values in ([1.0, 1.0, 250 / 255, 251 / 255, 0.2], [1.3, 0.8, 1.3, 1.3, 0.3])
     )
-    target = with_open_white(photo, lit.requires_grad_())
-    assert target[:, 0].tolist() == pytest.approx([1.3, 1.0, 0.9, 0.9]) and not target.requires_grad
+    found = cut_off(colors.requires_grad_(), photo)
+    assert found[:, 0].tolist() == pytest.approx([1.0, 0.8, 1.3, 251 / 255, 0.3])
+    found.sum().backward()
+    assert colors.grad[:, 0].tolist() == [0, 1, 1, 0, 1]

@@ -16,6 +16,7 @@ from source_folders import SETTINGS, alone, image, save, write_colmap
 
 from chebsplat.formats.artifact import read_manifest
 from chebsplat.formats.capture import Capture
+from chebsplat.photos.exposures import relit
 from chebsplat.stages.measuring.image_quality import figures_as_taken
 from chebsplat.stages.settings import IngestSection, PoseSection
 from chebsplat.stages.sources import assembly, colmap, colmap_model, common, photos
@@ -413,12 +414,15 @@ def test_test_photos_are_held_as_they_were_taken_and_measured_so(tmp_path, max_s
     views = {}
     for name, K in zip(capture.names, capture.Ks, strict=True):
         views[name] = View(torch.tensor(K).float(), torch.eye(4), *capture.size)
-    pictures = SimpleNamespace(
-        render=lambda view: (np.asarray(undistorted.resize((view.width, view.height))), None)
-    )
+
+    def render(view, stops):
+        picture = np.asarray(undistorted.resize((view.width, view.height)))
+        return picture if stops is None else relit(picture, stops), None
+
+    pictures = SimpleNamespace(render=render)
     undistorted = Image.fromarray(np.asarray(capture.images[0]))
     capture.taken = dict(enumerate(capture.taken))  # which gives one at a time alone
-    as_they_are = dict.fromkeys(views, np.zeros(3))
+    as_they_are = dict.fromkeys(views)
     right = figures_as_taken(capture, pictures, views, as_they_are)
     assert right["size"] == [400, 300] and right["psnr"] > (30 if max_side > 400 else 20)
     darker = dict.fromkeys(views, np.full(3, -0.3))
@@ -437,9 +441,9 @@ def test_the_size_of_photos_as_taken_is_one_that_they_have():
         K = torch.tensor([[20.0, 0, width / 4], [0, 20, height / 4], [0, 0, 1]])
         views[name] = View(K, torch.eye(4), width // 2, height // 2)
     grey = SimpleNamespace(
-        render=lambda view: (np.full((view.height, view.width, 3), 90, np.uint8), None)
+        render=lambda view, stops: (np.full((view.height, view.width, 3), 90, np.uint8), None)
     )
-    found = figures_as_taken(capture, grey, views, dict.fromkeys(views, np.zeros(3)))
+    found = figures_as_taken(capture, grey, views, dict.fromkeys(views))
     assert (found["size"], found["psnr"], found["ssim"]) == ([48, 32], 100, pytest.approx(1))
     assert figures_as_taken(capture, grey, {}, {}) is None
 
