@@ -72,8 +72,8 @@ def wants_lines(
     Args:    database: with features of all views; PROBED of the pairs [P, 2] are matched in it for
       the check.
     Choices: stricter than `wants_adjustment`: false also where too few pairs match, and where
-      features are coarse. Generated rooms lost by it (docs/results/photographs.md, "At
-      equal seconds"), and are matched by a free search.
+      features are coarse. Generated rooms lost by it at equal seconds, and are matched by a free
+      search.
     """
     if (
         capture.cam_from_world is None

@@ -57,6 +57,18 @@ def test_measured_exposures_are_those_the_photos_were_taken_with():
     )
 
 
+def test_the_darker_half_of_points_does_not_tell_of_exposures():
+    """Blue of most of the wall is dark, and brighter in every second photo; nothing else is."""
+    images = np.full((6, 40, 48, 3), 150, np.uint8)
+    images[:, :, 22:, 2] = np.linspace(18, 40, 40)[:, None]
+    images[::2, :, 22:, 2] = np.linspace(18, 40, 40)[:, None] * 1.5
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 2, 3] = 5
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    Ks = np.tile(K.double().numpy(), (6, 1, 1))
+    assert measured_exposures(images, Ks, poses, points) == pytest.approx(0, abs=0.03)
+
+
 def test_a_drift_is_measured_where_few_neighbours_see_the_same_points():
     """And in spite of a photo that something covers for a third of its points."""
     drift = 0.4 * np.sin(np.linspace(0, 3, 40))[:, None] * np.array([1, 0.8, 1.1])
