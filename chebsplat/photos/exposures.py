@@ -91,10 +91,10 @@ def measured_exposures(
     light = np.log2(light)
     exposures = _fitted(light, view, point, n_views)
     in_mean = light - exposures[view]  # nan of views without an exposure
-    seen = np.isfinite(in_mean).all(1)
-    if not seen.any():
+    finite = np.isfinite(in_mean).all(1)
+    if not finite.any():
         return exposures
-    light, view, point, in_mean = light[seen], view[seen], point[seen], in_mean[seen]
+    light, view, point, in_mean = light[finite], view[finite], point[finite], in_mean[finite]
     sums = np.stack([np.bincount(point, values) for values in in_mean.T], 1)
     darkest = (sums / np.maximum(np.bincount(point), 1)[:, None]).min(1)[point]
     bright = darkest >= min(np.log2(DIM), np.median(darkest))
