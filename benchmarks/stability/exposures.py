@@ -8,12 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.stability.case import Outcome, beside, case
-from chebsplat.photos.exposures import (
-    expected_exposures,
-    light_of,
-    measured_exposures,
-    relit,
-)
+from chebsplat.photos.exposures import expected_exposures, light_of, measured_exposures, relit
 
 HEIGHT, WIDTH, VIEWS, N = 60, 80, 6, 400
 K = np.array([[70.0, 0, WIDTH / 2], [0, 70.0, HEIGHT / 2], [0, 0, 1]])

@@ -20,7 +20,7 @@ TRAVEL, FASTEST = 10.0, 5e-2  # a features' rate: less than TRAVEL over all step
 DEPTH_WEIGHT = 0.8
 MOST_APART = 0.003  # of a point's depth, within which views agree on it
 LIFTED_FROM = 40  # views
-LEAST_SPREAD = 0.05  # stops between the photos' exposures, from which on they are measured
+LEAST_SPREAD = 0.05  # stops between the photos' exposures, from which on renders take them
 
 
 @dataclass(frozen=True)
